@@ -124,6 +124,7 @@ def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     yield "record_planes", "two", lambda: ((cloud, ptr, NO_RUNS, planes, competes, distance, floors), {})
     yield "near_planes", "two", lambda: ((cloud, ptr, planes[:, 0], distance), {})
     yield "fit_planes", "two", lambda: ((cloud, ptr, cloud[:, 2] > 0.05), {})
+    yield "refine_planes", "two", lambda: ((cloud, ptr, planes[:, 0], distance, None, None), {})
     yield from _calls_of_motions()
     yield from _calls_of_searches()
     yield from _calls_of_images()

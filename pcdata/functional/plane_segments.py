@@ -22,11 +22,10 @@ from pcdata.functional.planes import (
     checked_tilt,
     checked_up,
     draw_planes,
-    fit_planes,
     near_planes,
     ransac_plane,
     record_planes,
-    refined_planes,
+    refine_planes,
 )
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.voxels import voxel_downsample
@@ -48,7 +47,7 @@ _MOST_SPAN = 1e6
     probability=checked_probability,
     max_planes=checked_count,
     min_share=checked_fraction,
-    steps=(draw_planes, bound_runs, record_planes, near_planes, fit_planes),
+    steps=(draw_planes, bound_runs, record_planes, refine_planes),
     gradient=False,
 )
 def segment_planes(
@@ -132,7 +131,7 @@ def segment_planes(
     min_share=checked_fraction,
     likely_up=checked_up,
     viewpoint=checked_places,
-    steps=(draw_planes, bound_runs, record_planes, near_planes, fit_planes, nearest_rows, density_clusters),
+    steps=(draw_planes, bound_runs, record_planes, refine_planes, near_planes, nearest_rows, density_clusters),
     gradient=False,
 )
 def supporting_plane(
@@ -233,7 +232,7 @@ def supporting_plane(
     sampled = torch.cat(samples)
     sampled_ptr = ptr_from_counts([len(own) for own in samples], device=ptr.device)
     chosen = torch.stack(winners)
-    refined, _ = refined_planes(sampled, sampled_ptr, chosen.clone(), distance, up, max_tilt, backend)
+    refined, _ = refine_planes(sampled, sampled_ptr, chosen, distance, up, max_tilt, backend=backend)
     # Refitted normals have any sign; they stay on the side that was chosen.
     refined = torch.where((refined[:, :3] * chosen[:, :3]).sum(1, keepdim=True) < 0, -refined, refined)
     return refined.to(points.device), near_planes(points, ptr, refined, distance, backend=backend)

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import inner, op
+from pcdata.contracts.dispatch import REFERENCE, inner, op
 from pcdata.contracts.host import differing
 from pcdata.contracts.numbers import checked_count, checked_fraction, checked_length
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError
@@ -21,7 +21,7 @@ from pcdata.rng import seeded
 from pcdata.threads import at_once
 
 # The inlier set of real clouds settles in 3 to 8 rounds; the cap only stops a set that alternates for ever.
-_MAX_REFINEMENTS = 20
+MAX_REFINEMENTS = 20
 # Hypotheses and points looked at together: 1 MB of distances.
 _PLANES, _POINTS = 64, 4096
 # Hypotheses of the first look where few may do; as many again as there were after each.
@@ -148,6 +148,50 @@ def fit_planes(points: Tensor, ptr: Tensor, chosen: Tensor, *, backend: str = "a
     return torch.stack([none if plane is None else plane for plane in fitted])
 
 
+@inner
+def refine_planes(
+    points: Tensor,
+    ptr: Tensor,
+    planes: Tensor,  # (B, 4) on the CPU
+    distance: float,
+    ups: Tensor | None,  # (B, 3) unit vectors on the CPU
+    max_tilt: float | None,
+    runs: tuple[Tensor, ...] = (),  # of bound_runs, if they are known
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:  # planes (B, 4) on the CPU, inliers (N,)
+    """Refit to the inliers until they no longer change; return the last allowed planes and their inliers."""
+    planes = planes.clone()
+    inliers = near_planes(points, ptr, planes, distance, backend=REFERENCE)
+    unsettled = torch.arange(len(planes), dtype=torch.int64, device="cpu")  # clouds
+    rows, own, own_ptr, before = None, points, ptr, inliers
+    for _ in range(MAX_REFINEMENTS):
+        refitted = fit_planes(own, own_ptr, before, backend=REFERENCE)
+        fits = ~refitted[:, 0].isnan() & _within_tilt(refitted, None if ups is None else ups[unsettled], max_tilt)
+        after = near_planes(own, own_ptr, refitted, distance, backend=REFERENCE)
+        fits &= count_per_cloud(after, own_ptr).cpu() >= 3
+        settled = fits & (count_per_cloud(differing(after, before), own_ptr).cpu() == 0)
+        planes[unsettled[fits]] = refitted[fits]
+        chosen = after
+        if not bool(fits.all()):
+            taken = fits.to(own_ptr.device).repeat_interleave(counts_from_ptr(own_ptr))
+            chosen = torch.where(taken, after, before)
+        if rows is None:
+            inliers = chosen
+        else:
+            inliers[rows] = chosen
+        open_ = fits & ~settled
+        if not bool(open_.any()):
+            break
+        if not bool(open_.all()):
+            kept = open_.to(own_ptr.device).repeat_interleave(counts_from_ptr(own_ptr))
+            rows = kept.nonzero().squeeze(1) if rows is None else rows[kept]
+            own, own_ptr = own[kept], ptr_from_counts(counts_from_ptr(own_ptr)[open_.to(own_ptr.device)])
+            chosen, unsettled = chosen[kept], unsettled[open_]
+        before = chosen
+    return planes, inliers
+
+
 @op(
     points="N 3",
     ptr="ptr N B >= 3",
@@ -158,7 +202,7 @@ def fit_planes(points: Tensor, ptr: Tensor, chosen: Tensor, *, backend: str = "a
     max_tilt=checked_tilt,
     probability=checked_probability,
     guess=checked_guess,
-    steps=(draw_planes, bound_runs, record_planes, near_planes, fit_planes),
+    steps=(draw_planes, bound_runs, record_planes, refine_planes),
     gradient=False,
 )
 def ransac_plane(
@@ -238,7 +282,7 @@ def ransac_plane(
         )
         winners.append(_best_planes(hypotheses, is_plane, competes, near, distance, first))
     runs = runs if at_once >= num_clouds else ()  # of all clouds
-    planes, inliers = refined_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, backend, runs)
+    planes, inliers = refine_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, runs, backend=backend)
     return _face(planes, up, distance).to(points.device), inliers
 
 
@@ -333,50 +377,6 @@ def _count_near(points: Tensor, planes: Tensor, distance: float) -> Tensor:
             # Ones and zeros as floats: five times faster than bool, and exact below 2^24 points per block.
             counts[first : first + planes_per_block] += near.lt_(distance).sum(dim=1)
     return counts.long().cpu()
-
-
-def refined_planes(
-    points: Tensor,
-    ptr: Tensor,
-    planes: Tensor,  # (B, 4)
-    distance: float,
-    ups: Tensor | None,
-    max_tilt: float | None,
-    backend: str,
-    runs: tuple[Tensor, ...] = (),
-) -> tuple[Tensor, Tensor]:  # planes (B, 4), inliers (N,)
-    """Refit to the inliers until they no longer change; return the last allowed planes and their inliers.
-
-    The planes given are changed. ``runs`` are those of the points, if they are known.
-    """
-    inliers = near_planes(points, ptr, planes, distance, runs, backend=backend)
-    unsettled = torch.arange(len(planes), dtype=torch.int64, device="cpu")  # clouds
-    rows, own, own_ptr, before = None, points, ptr, inliers
-    for _ in range(_MAX_REFINEMENTS):
-        refitted = fit_planes(own, own_ptr, before, backend=backend)
-        fits = ~refitted[:, 0].isnan() & _within_tilt(refitted, None if ups is None else ups[unsettled], max_tilt)
-        after = near_planes(own, own_ptr, refitted, distance, runs, backend=backend)
-        fits &= count_per_cloud(after, own_ptr).cpu() >= 3
-        settled = fits & (count_per_cloud(differing(after, before), own_ptr).cpu() == 0)
-        planes[unsettled[fits]] = refitted[fits]
-        chosen = after
-        if not bool(fits.all()):
-            taken = fits.to(own_ptr.device).repeat_interleave(counts_from_ptr(own_ptr))
-            chosen = torch.where(taken, after, before)
-        if rows is None:
-            inliers = chosen
-        else:
-            inliers[rows] = chosen
-        open_ = fits & ~settled
-        if not bool(open_.any()):
-            break
-        if not bool(open_.all()):
-            kept = open_.to(own_ptr.device).repeat_interleave(counts_from_ptr(own_ptr))
-            rows = kept.nonzero().squeeze(1) if rows is None else rows[kept]
-            own, own_ptr = own[kept], ptr_from_counts(counts_from_ptr(own_ptr)[open_.to(own_ptr.device)])
-            chosen, unsettled, runs = chosen[kept], unsettled[open_], ()
-        before = chosen
-    return planes, inliers
 
 
 def _clouds_between(points: Tensor, ptr: Tensor, first: int, stop: int) -> tuple[Tensor, Tensor]:

@@ -10,6 +10,7 @@ from torch import Tensor
 import pcdata.functional.planes
 import pcdata.functional.sampling  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
+from pcdata.functional.planes import MAX_REFINEMENTS
 from pcdata.functional.rows import counts_from_ptr, first_per_cloud, ptr_from_counts
 from pcdata.functional.voxels import SIZE_TOLERANCE
 from pcdata.geometry.plane_fit import FLAT, plane_of_moments
@@ -89,9 +90,9 @@ def bound_runs(points: Tensor, ptr: Tensor) -> tuple[Tensor, ...]:
     runs = torch.where(counts > _SMALL_CLOUD, (counts + (_RUN - 1)) // _RUN, 0)
     run_ptr = ptr_from_counts((runs + (_RUNS_AT_ONCE - 1)) // _RUNS_AT_ONCE * _RUNS_AT_ONCE)
     num_runs = int(run_ptr[-1])
-    facts, columns = room((8, num_runs), torch.float32), room((3, _RUN * num_runs), torch.float32)
-    call("pc_bound_runs", points, ptr, len(counts), run_ptr, facts, columns)
-    return run_ptr, facts, columns
+    facts = room((8, num_runs), torch.float32)
+    call("pc_bound_runs", points, ptr, len(counts), run_ptr, facts)
+    return run_ptr, facts
 
 
 @kernel("record_planes", "cpu")
@@ -106,7 +107,7 @@ def record_planes(
 ) -> Tensor:
     """Look at runs of points first: they tell of most planes that they are no records, and of most points."""
     counts = room(planes.shape[:2], torch.int64)
-    count, some, known = len(planes), planes.shape[1], runs or (None, None, None)
+    count, some, known = len(planes), planes.shape[1], runs or (None, None)
     call(
         "pc_record_planes", points, ptr, count, *known, planes.float(), competes, some, float(distance), floors, counts
     )  # fmt: skip
@@ -117,9 +118,28 @@ def record_planes(
 def near_planes(points: Tensor, ptr: Tensor, planes: Tensor, distance: float, runs: tuple[Tensor, ...] = ()) -> Tensor:
     """Mark in one pass, runs of points at once where they are known."""
     near = room(len(points), torch.bool)
-    known = runs or (None, None, None)
+    known = runs or (None, None)
     call("pc_near_planes", points, ptr, len(planes), *known, planes.float(), float(distance), near)
     return near
+
+
+@kernel("refine_planes", "cpu")
+def refine_planes(
+    points: Tensor,
+    ptr: Tensor,
+    planes: Tensor,
+    distance: float,
+    ups: Tensor | None,
+    max_tilt: float | None,
+    runs: tuple[Tensor, ...] = (),
+) -> tuple[Tensor, Tensor]:
+    """Look again at those runs of points alone that the last step of a plane may have changed."""
+    refined, near = planes.clone(), room(len(points), torch.bool)
+    known = runs or (None, None)
+    up, tilt = (None, 0.0) if ups is None or max_tilt is None else (ups.contiguous(), max_tilt)
+    arrays = points, ptr, len(planes), *known, float(distance), up, tilt, FLAT, MAX_REFINEMENTS, refined, near
+    call("pc_refine_planes", *arrays)
+    return refined, near
 
 
 @kernel("fit_planes", "cpu")

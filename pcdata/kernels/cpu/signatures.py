@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x003378B0793F807
+INTERFACE_NUMBER = 0xA2B4C07D479B83F
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -99,11 +99,13 @@ pc_find_voxel_sizes: float* points, int64* ptr, int64 num_clouds, int64 num_poin
     int64* possible
 pc_planes_of_triples: float* points, int64* ptr, int64 num_clouds, int64* triples, int64 count, int64* which, double
     flat, double* planes
-pc_bound_runs: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, float* columns
-pc_record_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, float* columns, float*
-    planes, uint8* competes, int64 num_planes, double distance, int64* floors, int64* counts
-pc_near_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, float* columns, float* planes,
-    double distance, uint8* near
+pc_bound_runs: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs
+pc_record_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, float* planes, uint8*
+    competes, int64 num_planes, double distance, int64* floors, int64* counts
+pc_near_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, float* planes, double
+    distance, uint8* near
+pc_refine_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, double distance, double* up,
+    double max_tilt, double flat, int64 rounds, double* planes, uint8* near
 pc_moments: float* points, int64* ptr, int64 num_clouds, uint8* mask, double* centers, double* sums
 pc_reach: float* points, int64 rows, double* places, int64 num_places, double least, double* reach
 pc_fit_surface: float* points, int64 count, double* reach, double* plane, double* axes, double* numbers, double* height,

@@ -312,6 +312,42 @@ def test_runs_of_points_change_no_count(order, scale, machine):
         assert_records_equal(points, ptr, drawn, competes, distance, torch.tensor([0, 3, 0, 500, 10_000]))
 
 
+@pytest.mark.parametrize("order", ["image", "shuffled", "sorted", "line"])
+def test_refinement_equals_the_reference(order, machine):
+    """Of large and small clouds, whatever their order says of the points, with any number of threads."""
+    from pcdata.functional import planes
+
+    points, generator = organized(130, 170), seeded(2)
+    if order == "shuffled":
+        points = points[torch.randperm(len(points), generator=generator)]
+    elif order == "sorted":
+        points = points[points[:, 2].argsort()]
+    elif order == "line":
+        points[:9000] = torch.linspace(0, 1, 9000)[:, None] * torch.tensor([0.5, 1.0, 2.0])
+    counts = [len(points), 700, 0, 8193, 5]
+    points = torch.cat([points, points[:700], points[:8193], points[-5:]]).contiguous()
+    ptr = ptr_from_counts(counts)
+    begun = planes_through(points[draw_rows(8193, 3, 1, seeded(0)) + ptr[3]]).repeat(len(counts), 1)
+    if order == "line":
+        begun = planes_through(torch.tensor([[[0.0, 0, 0], [0.5, 1, 2], [1.0, 0, 0]]])).repeat(len(counts), 1)
+    assert not bool(begun.isnan().any())
+    begun[3:, 3] += 0.004
+    up = torch.nn.functional.normalize(torch.tensor([[0.1, 0.2, -1.0]], dtype=torch.float64)).repeat(len(counts), 1)
+    for distance, max_tilt in ((0.02, None), (0.005, None), (0.02, 0.3), (1e-5, None)):
+        arguments = points, ptr, begun, distance, None if max_tilt is None else up, max_tilt
+        expected = planes.refine_planes(*arguments, backend="torch")
+        found = [planes.refine_planes(*arguments, backend="cpu")]
+        for threads in (1, 2):
+            torch.set_num_threads(threads)
+            found.append(planes.refine_planes(*arguments, planes.bound_runs(points, ptr, backend="cpu"), backend="cpu"))
+        for own_planes, inliers in found:
+            assert torch.equal(own_planes, found[0][0])
+            assert torch.equal(inliers, expected[1])
+        cosine = (found[0][0][:, :3] * expected[0][:, :3]).sum(1)
+        assert torch.allclose(cosine.abs(), torch.ones_like(cosine), rtol=0, atol=1e-12)
+        torch.testing.assert_close(found[0][0][:, 3] * cosine.sign(), expected[0][:, 3], rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("backend", ["cpu", "torch"])
 def test_a_batch_of_many_small_clouds_is_each_cloud_alone(backend):
     """More clouds than are looked at one by one, of different sizes, and more hypotheses than are drawn at a time."""

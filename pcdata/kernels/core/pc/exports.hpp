@@ -396,23 +396,32 @@ PC_EXPORT int32_t pc_planes_of_triples(const pc_context* context, const float* p
 
 // Runs of 64 points that follow each other in a cloud, for pc_record_planes. run_ptr (num_clouds+1,) has room for whole
 // groups of 16 runs per cloud -> runs (8, R): first point, last point, how far the others lie from the segment between
-// them, how many there are; columns (3, 64 R): the points, NaN where a run has fewer.
+// them, how many there are.
 PC_EXPORT int32_t pc_bound_runs(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
-                                const int64_t* run_ptr, float* runs, float* columns);
+                                const int64_t* run_ptr, float* runs);
 
 // points (N, 3), ptr (num_clouds+1,), what pc_bound_runs made or null, planes (num_clouds, H, 4), competes (num_clouds,
 // H) 0 or 1, floors (num_clouds,) -> counts (num_clouds, H): the points of each cloud with |((nx*x + ny*y) + nz*z) + d|
 // < distance, where the plane competes and has more of them than all before it that do, and than the floor; else 0.
 PC_EXPORT int32_t pc_record_planes(const pc_context* context, const float* points, const int64_t* ptr,
-                                   int64_t num_clouds, const int64_t* run_ptr, const float* runs, const float* columns,
-                                   const float* planes, const uint8_t* competes, int64_t num_planes, double distance,
-                                   const int64_t* floors, int64_t* counts);
+                                   int64_t num_clouds, const int64_t* run_ptr, const float* runs, const float* planes,
+                                   const uint8_t* competes, int64_t num_planes, double distance, const int64_t* floors,
+                                   int64_t* counts);
 
 // points (N, 3), ptr (num_clouds+1,), what pc_bound_runs made or null, planes (num_clouds, 4) -> near (N,), 0 or 1:
 // whether a point is near its cloud's.
 PC_EXPORT int32_t pc_near_planes(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
-                                 const int64_t* run_ptr, const float* runs, const float* columns, const float* planes,
-                                 double distance, uint8_t* near);
+                                 const int64_t* run_ptr, const float* runs, const float* planes, double distance,
+                                 uint8_t* near);
+
+// points (N, 3), ptr (num_clouds+1,), what pc_bound_runs made or null; planes (num_clouds, 4) become the least-squares
+// planes of the points near them, again and again, at most `rounds` times, until those no longer change; the last that
+// lies on no line, has 3 points near it and is within max_tilt of its cloud's up (num_clouds, 3) or null, or of -up,
+// and the points near it -> near (N,). The same bits for any number of threads and any instruction set.
+PC_EXPORT int32_t pc_refine_planes(const pc_context* context, const float* points, const int64_t* ptr,
+                                   int64_t num_clouds, const int64_t* run_ptr, const float* runs, double distance,
+                                   const double* up, double max_tilt, double flat, int64_t rounds, double* planes,
+                                   uint8_t* near);
 
 // points (N, 3), ptr (num_clouds+1,), mask (N,) of 0 and 1, centers (num_clouds, 3) -> sums (num_clouds, 11) over the
 // chosen points of each cloud, with p their offsets from its center: count, largest absolute coordinate, x, y, z, xx,

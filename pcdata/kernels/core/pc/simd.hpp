@@ -304,6 +304,50 @@ inline Int32Register gather(const int32_t* from, const Int32Register& index) {
   return reinterpret_cast<Int32Register>(gather(reinterpret_cast<const float*>(from), index));
 }
 
+// Points that follow each other, x y z each, as one register per coordinate.
+inline void load_points(const float* from, FloatRegister& x, FloatRegister& y, FloatRegister& z) {
+#if defined(PC_AVX512)
+  const auto a = native(load<FloatRegister>(from)), b = native(load<FloatRegister>(from + 16)),
+             c = native(load<FloatRegister>(from + 32));
+  // Places beyond 15 are in the second source; of the third, where the first two have no more.
+  const auto pick = [&](__m512i from_ab, __m512i from_c) {
+    return reinterpret_cast<FloatRegister>(_mm512_permutex2var_ps(_mm512_permutex2var_ps(a, from_ab, b), from_c, c));
+  };
+  x = pick(_mm512_setr_epi32(0, 3, 6, 9, 12, 15, 18, 21, 24, 27, 30, 0, 0, 0, 0, 0),
+           _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 17, 20, 23, 26, 29));
+  y = pick(_mm512_setr_epi32(1, 4, 7, 10, 13, 16, 19, 22, 25, 28, 31, 0, 0, 0, 0, 0),
+           _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 18, 21, 24, 27, 30));
+  z = pick(_mm512_setr_epi32(2, 5, 8, 11, 14, 17, 20, 23, 26, 29, 0, 0, 0, 0, 0, 0),
+           _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 16, 19, 22, 25, 28, 31));
+#elif defined(__SSE2__)
+  // Four points in three registers of four; AVX2 does twice that in its two halves.
+  const auto quarter = [](const float* at) { return _mm_loadu_ps(at); };
+#if defined(__AVX2__)
+  const auto both = [&](int k) {
+    return _mm256_insertf128_ps(_mm256_castps128_ps256(quarter(from + 4 * k)), quarter(from + 12 + 4 * k), 1);
+  };
+  const __m256 a = both(0), b = both(1), c = both(2);
+#define PC_SHUFFLE _mm256_shuffle_ps
+#else
+  const __m128 a = quarter(from), b = quarter(from + 4), c = quarter(from + 8);
+#define PC_SHUFFLE _mm_shuffle_ps
+#endif
+  const auto late = PC_SHUFFLE(b, c, _MM_SHUFFLE(2, 1, 3, 2));   // x2 y2 x3 y3
+  const auto early = PC_SHUFFLE(a, b, _MM_SHUFFLE(1, 0, 2, 1));  // y0 z0 y1 z1
+  x = reinterpret_cast<FloatRegister>(PC_SHUFFLE(a, late, _MM_SHUFFLE(2, 0, 3, 0)));
+  y = reinterpret_cast<FloatRegister>(PC_SHUFFLE(early, late, _MM_SHUFFLE(3, 1, 2, 0)));
+  z = reinterpret_cast<FloatRegister>(PC_SHUFFLE(early, c, _MM_SHUFFLE(3, 0, 3, 1)));
+#undef PC_SHUFFLE
+#elif defined(PC_NEON)
+  const float32x4x3_t axes = vld3q_f32(from);
+  x = reinterpret_cast<FloatRegister>(axes.val[0]);
+  y = reinterpret_cast<FloatRegister>(axes.val[1]);
+  z = reinterpret_cast<FloatRegister>(axes.val[2]);
+#else
+  for (int i = 0; i < kLanes; ++i) x[i] = from[3 * i], y[i] = from[3 * i + 1], z[i] = from[3 * i + 2];
+#endif
+}
+
 // One bit per number of 64: whether it is negative.
 inline uint64_t signs_of(const int8_t* numbers) {
 #if defined(__AVX512BW__)

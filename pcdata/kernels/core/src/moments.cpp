@@ -8,9 +8,6 @@ namespace {
 constexpr int64_t kSummedPiece = 8192;  // points summed on their own; pieces are added in order
 constexpr int kBlock = 64;              // points with one array per coordinate at a time
 
-typedef float Float8 __attribute__((vector_size(32)));
-typedef int64_t Long8 __attribute__((vector_size(64)));
-
 struct Sums {
   PlaneMoments moments;
   int32_t largest = 0;  // absolute coordinate; as bits, which order like the numbers while none is negative

@@ -35,11 +35,7 @@ void mark_near_runs(const Runs& runs, int64_t begin, int64_t end, const Plane& p
       } else if (inside >> lane & 1) {
         std::fill_n(to, size, uint8_t{1});
       } else {
-        const float *x = runs.x + kRun * run, *y = runs.y + kRun * run, *z = runs.z + kRun * run;
-        for (int64_t k = 0; k < size; ++k) {
-          const float p[3] = {x[k], y[k], z[k]};
-          to[k] = plane.is_near(p, distance);
-        }
+        mark_near(runs.points, kRun * run, kRun * run + size, plane, distance, near);
       }
     }
   }
@@ -55,46 +51,6 @@ void count_piece(const float* points, int64_t begin, int64_t end, const Plane* p
     for (; h + kTogether <= num_planes; h += kTogether) count_near<kTogether>(block, planes + h, distance, counts + h);
     for (; h < num_planes; ++h) count_near<1>(block, planes + h, distance, counts + h);
   }
-}
-
-// Write what is known of the run of points [begin, end), and its points as columns.
-void bound_run(const float* points, int64_t begin, int64_t end, float* facts, int64_t num_runs, float* columns) {
-  const auto size = static_cast<int>(end - begin);
-  float largest = 0;
-  for (int axis = 0; axis < 3; ++axis) {
-    float* column = columns + kRun * num_runs * axis;
-    for (int i = 0; i < size; ++i) {
-      column[i] = points[3 * (begin + i) + axis];
-      largest = maximum(largest, std::fabs(column[i]));
-    }
-    for (int i = size; i < kRun; ++i) column[i] = std::numeric_limits<float>::quiet_NaN();
-  }
-  const float *x = columns, *y = columns + kRun * num_runs, *z = columns + 2 * kRun * num_runs;
-  const int last = size - 1;
-  float reach = 0;
-  if (size > 0) {
-    const float dx = x[last] - x[0], dy = y[last] - y[0], dz = z[last] - z[0];
-    const float square = squared_length(dx, dy, dz);
-    const float inverse = square > 0 ? 1 / square : 0;
-    for (int i = 0; i < size; ++i) {
-      const float px = x[i] - x[0], py = y[i] - y[0], pz = z[i] - z[0];
-      // Whatever the rounding, any point of the segment bounds the distance to it.
-      const float t = minimum(maximum((px * dx + py * dy + pz * dz) * inverse, 0.0F), 1.0F);
-      const float ex = px - t * dx, ey = py - t * dy, ez = pz - t * dz;
-      reach = maximum(reach, squared_length(ex, ey, ez));
-    }
-    reach = 1.00001F * std::sqrt(reach) + 3 * kRounding * largest;
-    if (!(largest < kHuge)) reach = std::numeric_limits<float>::infinity();
-  }
-  const float values[8] = {size > 0 ? x[0] : 0,
-                           size > 0 ? y[0] : 0,
-                           size > 0 ? z[0] : 0,
-                           size > 0 ? x[last] : 0,
-                           size > 0 ? y[last] : 0,
-                           size > 0 ? z[last] : 0,
-                           reach,
-                           static_cast<float>(size)};
-  for (int k = 0; k < 8; ++k) facts[k * num_runs] = values[k];
 }
 
 // Finds the records among the planes of one cloud: those that have more points near them than all before.
@@ -229,25 +185,23 @@ PC_EXPORT int32_t pc_planes_of_triples(const pc_context* context, const float* p
 }
 
 PC_EXPORT int32_t pc_bound_runs(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
-                                const int64_t* run_ptr, float* runs, float* columns) {
+                                const int64_t* run_ptr, float* runs) {
   using namespace pc;
   using namespace pc::planes;
   return guarded([&] {
     const int64_t num_runs = run_ptr[num_clouds];
     for (int64_t cloud = 0; cloud < num_clouds; ++cloud)
       parallel_for(*context, run_ptr[cloud + 1] - run_ptr[cloud], 256, [&](int64_t begin, int64_t end, int64_t) {
-        for (int64_t r = begin; r < end; ++r) {
-          const int64_t run = run_ptr[cloud] + r, first = std::min(ptr[cloud] + kRun * r, ptr[cloud + 1]);
-          bound_run(points, first, std::min(first + kRun, ptr[cloud + 1]), runs + run, num_runs, columns + kRun * run);
-        }
+        for (int64_t r = begin; r < end; ++r)
+          bound_run(points + 3 * ptr[cloud], ptr[cloud + 1] - ptr[cloud], r, runs + run_ptr[cloud] + r, num_runs);
       });
   });
 }
 
 PC_EXPORT int32_t pc_record_planes(const pc_context* context, const float* points, const int64_t* ptr,
-                                   int64_t num_clouds, const int64_t* run_ptr, const float* runs, const float* columns,
-                                   const float* planes, const uint8_t* competes, int64_t num_planes, double distance,
-                                   const int64_t* floors, int64_t* counts) {
+                                   int64_t num_clouds, const int64_t* run_ptr, const float* runs, const float* planes,
+                                   const uint8_t* competes, int64_t num_planes, double distance, const int64_t* floors,
+                                   int64_t* counts) {
   using namespace pc;
   using namespace pc::planes;
   return guarded([&] {
@@ -255,7 +209,7 @@ PC_EXPORT int32_t pc_record_planes(const pc_context* context, const float* point
     const auto rows_of = [&](int64_t cloud) { return Range{ptr[cloud], ptr[cloud + 1]}; };
     const auto find = [&](int64_t cloud) {
       const Range own = run_ptr == nullptr ? Range{0, 0} : Range{run_ptr[cloud], run_ptr[cloud + 1]};
-      const Runs mine(runs, columns, run_ptr == nullptr ? 0 : run_ptr[num_clouds], own.begin, own.end);
+      const Runs mine(runs, run_ptr == nullptr ? 0 : run_ptr[num_clouds], own, points, rows_of(cloud));
       Records(*context, points, rows_of(cloud), mine, all + cloud * num_planes, competes + cloud * num_planes,
               num_planes, static_cast<float>(distance), floors[cloud], counts + cloud * num_planes)
           .find();
@@ -270,8 +224,8 @@ PC_EXPORT int32_t pc_record_planes(const pc_context* context, const float* point
 }
 
 PC_EXPORT int32_t pc_near_planes(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
-                                 const int64_t* run_ptr, const float* runs, const float* columns, const float* planes,
-                                 double distance, uint8_t* near) {
+                                 const int64_t* run_ptr, const float* runs, const float* planes, double distance,
+                                 uint8_t* near) {
   using namespace pc;
   using namespace pc::planes;
   return guarded([&] {
@@ -284,7 +238,8 @@ PC_EXPORT int32_t pc_near_planes(const pc_context* context, const float* points,
             mark_near(points, piece.begin, piece.end, all[own], limit, near);
             return;
           }
-          const Runs mine(runs, columns, run_ptr[num_clouds], run_ptr[own], run_ptr[own + 1]);
+          const Runs mine(runs, run_ptr[num_clouds], {run_ptr[own], run_ptr[own + 1]}, points,
+                          {ptr[own], ptr[own + 1]});
           const int64_t first = (piece.begin - ptr[own]) / kRun;  // pieces are whole groups of runs
           mark_near_runs(mine, first, first + runs_of(piece.end - piece.begin), all[own], limit, near + ptr[own]);
         });

@@ -30,12 +30,20 @@ struct PointBlock {
   }
 };
 
-// Lanes of ones where |((nx*x + ny*y) + nz*z) + d| < distance, in separate float operations like the reference.
+inline FloatRegister magnitude(const FloatRegister& value) {
+  return reinterpret_cast<FloatRegister>(reinterpret_cast<Int32Register>(value) & 0x7FFFFFFF);
+}
+
+// nx*x + ny*y + nz*z + d, in separate float operations like the reference.
+inline FloatRegister offset_from(const Plane& plane, const FloatRegister& x, const FloatRegister& y,
+                                 const FloatRegister& z) {
+  return ((plane.x * x + plane.y * y) + plane.z * z) + plane.d;
+}
+
+// Lanes of ones where |((nx*x + ny*y) + nz*z) + d| < distance.
 inline Int32Register is_near(const Plane& plane, float distance, const FloatRegister& x, const FloatRegister& y,
                              const FloatRegister& z) {
-  const FloatRegister signed_distance = ((plane.x * x + plane.y * y) + plane.z * z) + plane.d;
-  const Int32Register magnitude = reinterpret_cast<Int32Register>(signed_distance) & 0x7FFFFFFF;
-  return reinterpret_cast<FloatRegister>(magnitude) < distance;
+  return magnitude(offset_from(plane, x, y, z)) < distance;
 }
 
 // Add to counts[h] the points of a block near planes[h]. Several planes share each load of a point.
@@ -52,6 +60,8 @@ inline void count_near(const PointBlock& block, const Plane* planes, float dista
 }
 
 typedef double Double8 __attribute__((vector_size(64)));
+typedef float Float8 __attribute__((vector_size(32)));
+typedef int64_t Long8 __attribute__((vector_size(64)));
 
 // Sums over chosen points about a center, each in eight lanes so that every instruction set adds in the same order.
 struct PlaneMoments {
