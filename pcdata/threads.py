@@ -7,16 +7,18 @@ lasts until the system gives it back, milliseconds later: a hundred operations o
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from typing import TypeVar
 
 import torch
 
 One = TypeVar("One")
 Other = TypeVar("Other")
+Read = TypeVar("Read")
 
 _core_threads: ContextVar[int | None] = ContextVar("core_threads", default=None)
 
@@ -69,3 +71,41 @@ def in_threads(function: Callable[[One], Other], items: Iterable[One]) -> list[O
         return [function(one) for one in given]
     with torch_on_one_thread(), ThreadPoolExecutor(count) as pool:
         return list(pool.map(function, given))
+
+
+def while_reading(
+    read: Callable[[One], Read], work: Callable[[Read], Other], items: Iterable[One], *, at_once: int = 1
+) -> Iterator[Other]:
+    """Yield what ``work`` makes of what ``read`` gives for each item, in order, and read the next ones meanwhile.
+
+    Everything is read by the calling thread, as files that are open want it, and an error in reading comes in its
+    turn. Where the core may use one thread alone, all happens one after another.
+
+    Args:
+        read: what takes an item to what is worked on.
+        work: runs in other threads; with ``at_once=1`` in the order of the items, one at a time.
+        items: what is gone through.
+        at_once: how many are worked on; so many and one more are in memory.
+    """
+    count = core_threads()
+    if count < 2:
+        for item in items:
+            yield work(read(item))
+        return
+    apart = copy_context()
+    apart.run(_core_threads.set, count)
+    at_work: deque[Future[Other]] = deque()
+    with ThreadPoolExecutor(at_once) as pool:
+        for item in items:
+            try:
+                with torch_on_one_thread():
+                    given = read(item)
+            except Exception:
+                while at_work:
+                    yield at_work.popleft().result()
+                raise
+            if len(at_work) == at_once:
+                yield at_work.popleft().result()
+            at_work.append(pool.submit(apart.copy().run, torch_on_one_thread()(work), given))
+        while at_work:
+            yield at_work.popleft().result()

@@ -6,6 +6,7 @@ import ast
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import torch
 
 import pcdata
 from pcdata.synthetic import SyntheticSource, tabletop
-from pcdata.threads import core_threads, in_threads, torch_on_one_thread
+from pcdata.threads import core_threads, in_threads, torch_on_one_thread, while_reading
 from pcdata.validation import validate_frame, validate_source
 
 
@@ -100,3 +101,64 @@ def test_the_first_error_of_threads_is_raised():
 
     with pytest.raises(ValueError, match="1"):
         in_threads(fails, range(4))
+
+
+@pytest.mark.parametrize("at_once", [1, 2])
+def test_what_is_read_in_the_callers_thread_is_worked_on_in_others_in_order(three_threads, at_once):
+    readers, workers, in_memory, most = set(), set(), set(), 0
+
+    def read(item):
+        nonlocal most
+        readers.add(threading.get_ident())
+        in_memory.add(item)
+        most = max(most, len(in_memory))
+        return item
+
+    def work(item):
+        workers.add((threading.get_ident(), (torch.get_num_threads(), core_threads())))
+        time.sleep(0.02 if item % 2 else 0.0)
+        in_memory.discard(item)
+        return item * item
+
+    assert [*while_reading(read, work, range(9), at_once=at_once)] == [item * item for item in range(9)]
+    assert readers == {threading.get_ident()}
+    assert most <= at_once + 1
+    assert threading.get_ident() not in {who for who, _ in workers}
+    assert {numbers for _, numbers in workers} == {(1, 3)}
+    assert (torch.get_num_threads(), core_threads()) == (3, 3)
+
+
+@pytest.mark.parametrize("stage", ["read", "work"])
+def test_an_error_comes_in_its_turn_and_what_was_before_it_is_given(three_threads, stage):
+    def fails(item):
+        if item == 3:
+            raise KeyError(item)
+        return item
+
+    same = [lambda item: item, fails]
+    read, work = same[::-1] if stage == "read" else same
+    taken = while_reading(read, work, range(6))
+    assert [next(taken) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(KeyError, match="3"):
+        next(taken)
+    assert torch.get_num_threads() == 3
+
+
+def test_who_stops_early_leaves_no_thread_behind(three_threads):
+    before = threading.active_count()
+    taken = while_reading(lambda item: item, lambda item: item, range(1000))
+    assert next(taken) == 0
+    taken.close()
+    assert threading.active_count() == before
+
+
+def test_one_thread_reads_and_works_in_turns():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        done = []
+        for item in while_reading(lambda item: done.append(f"read {item}") or item, lambda item: item, range(2)):
+            done.append(f"given {item}")
+        assert done == ["read 0", "given 0", "read 1", "given 1"]
+    finally:
+        torch.set_num_threads(before)

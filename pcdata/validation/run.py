@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ from pcdata.errors import DTypeError, IntrinsicsError, NoReadingError, PcdataErr
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids, recordings_of
 from pcdata.io.sources.source import stored_captures
 from pcdata.structures import DepthFrame, PointCloud
-from pcdata.threads import torch_on_one_thread
+from pcdata.threads import torch_on_one_thread, while_reading
 from pcdata.validation import checks as _checks  # noqa: F401  # registers them
 from pcdata.validation.capture_check import CHECKS, Check
 from pcdata.validation.capture_limits import CaptureLimits
@@ -56,7 +58,7 @@ def validate_frame(frame: DepthFrame, *, limits: CaptureLimits | None = None) ->
 def validate_source(source: CaptureSource, *, limits: CaptureLimits | None = None) -> Iterator[SampleReport]:
     """Check every capture of a source, and compare it with those of its recording before it; yields a report for each.
 
-    One capture is held at a time, so memory does not grow with their number. A capture that cannot be read gives a
+    One capture is held, and the next one is read meanwhile, so memory does not grow with their number. A capture that cannot be read gives a
     report with a failed check, and the others follow. After a recording a last report (``whole``) judges over all its
     captures together what single ones tell less surely: the registration of color and depth, and the direction of the
     poses. Its sample id is :data:`WHOLE`; where sources were joined, ``NAME/*`` tells the recordings apart.
@@ -77,9 +79,7 @@ def _reports(source: CaptureSource, limits: CaptureLimits) -> Iterator[SampleRep
     recordings = recordings_of(source)
     for ids, name in zip(recordings, _names_of(recordings)):
         series = _Series(limits)
-        for sample_id in ids:
-            found = tuple(series.check(source, sample_id))
-            yield SampleReport(sample_id, found, views=series.views, refused=series.refused)
+        yield from while_reading(partial(_read, source), series.check, ids)
         if whole := series.whole():
             yield SampleReport(name, tuple(whole), whole=True)
 
@@ -116,43 +116,61 @@ def check_of_error(error: PcdataError, *, whole: bool = False) -> Finding:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """A capture as it came from its source."""
+
+    sample_id: str
+    stored: list[Path]  # its depth files, where they may be looked at
+    capture: DepthFrame | PointCloud | None
+    refused: PcdataError | None
+
+
+def _read(source: CaptureSource, sample_id: str) -> _Read:
+    """Read a capture; the files that hold it, too, once it is known that no link leads out of the captures."""
+    files: list[Path] = []
+    try:
+        stored = stored_captures(source, sample_id)
+        for layout, own in stored:
+            layout.check_links(own)
+        files = [file for layout, own in stored for file in layout.depth_files(own)]
+        capture = source.load(sample_id)
+    except PcdataError as error:
+        return _Read(sample_id, files, None, error)
+    if not isinstance(capture, (DepthFrame, PointCloud)):
+        raise DTypeError(
+            f"validate_source: {source!r} gives a {type(capture).__name__} for {sample_id!r}; load must return a "
+            "DepthFrame or a PointCloud"
+        )
+    return _Read(sample_id, files, capture, None)
+
+
 class _Series:
     """Checks captures one after another; the checks remember what the next ones are compared with."""
 
     def __init__(self, limits: CaptureLimits) -> None:
         self._limits = limits
         self._checks = [(check, check.memory()) for check in CHECKS.values()]
-        self.views: tuple[str, ...] = ()  # of the last capture
-        self.refused = False  # whether it could not be read
 
     @torch_on_one_thread()
-    def check(self, source: CaptureSource, sample_id: str) -> list[Finding]:
+    def check(self, read: _Read) -> SampleReport:
         found: list[Finding] = []
-        self.views, self.refused = (), False
         try:
-            stored = stored_captures(source, sample_id)
-            for layout, own in stored:
-                layout.check_links(own)
-            if stored:
-                depth = [file for layout, own in stored for file in layout.depth_files(own)]
-                for check, memory in self._checks:  # what a file refuses is told as what a reader refuses
+            if read.stored:  # what a file refuses is told as what a reader refuses
+                for check, memory in self._checks:
                     if Path in check.of:
-                        found += check.judge(depth, self._limits, found, *memory)
-            capture = source.load(sample_id)
+                        found += check.judge(read.stored, self._limits, found, *memory)
+            if read.refused is not None:
+                raise read.refused
         except PcdataError as error:
-            self.refused = True
-            return [*found, check_of_error(error)]
-        if not isinstance(capture, (DepthFrame, PointCloud)):
-            raise DTypeError(
-                f"validate_source: {source!r} gives a {type(capture).__name__} for {sample_id!r}; load must return a "
-                "DepthFrame or a PointCloud"
-            )
+            return SampleReport(read.sample_id, (*found, check_of_error(error)), refused=True)
+        capture, views = read.capture, ()
         if isinstance(capture, DepthFrame):
-            self.views = tuple(view_names(capture.provenance, capture.num_views))
+            views = tuple(view_names(capture.provenance, capture.num_views))
         for check, memory in self._checks:
             if isinstance(capture, check.of):
                 found += _asked(check, check.judge, capture, self._limits, found, *memory)
-        return found
+        return SampleReport(read.sample_id, tuple(found), views=views)
 
     @torch_on_one_thread()
     def whole(self) -> list[Finding]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import heapq
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from pcdata.report.html.overlaps import overlap_of
 from pcdata.report.html.pictures import WIDTH, color_picture, confidence_picture, depth_picture, edges_picture
 from pcdata.report.html.scene import MOST_POINTS, SampleScene, Stage, raw_cloud, stage_of, stages_of
 from pcdata.structures import METRE, DepthFrame, PointCloud
+from pcdata.threads import core_threads, while_reading
 from pcdata.transforms import Compose, Transform, describe_objects
 from pcdata.validation import CaptureLimits, validate_source
 from pcdata.validation.grading import Grading, Trend
@@ -151,7 +153,14 @@ def gather_captures(
             if progress is not None:
                 progress(place + 1, total, report.sample_id)
     places = _places_shown(worst, total, num_shown)
-    looked = tuple(look(source, place, pipeline=pipeline, num_shown=num_shown) for place in places)
+    looked = tuple(
+        while_reading(
+            partial(_opened, source),
+            partial(_looked, pipeline=pipeline, num_shown=num_shown),
+            places,
+            at_once=min(2, core_threads()),
+        )
+    )
     return Gathered(
         title=title or str(source),
         source=str(source),
@@ -180,11 +189,23 @@ def look(
     num_shown: int = 1,
 ) -> Looked:
     """Return what is shown of one capture of ``num_shown``."""
+    return _looked(_opened(source, place), pipeline=pipeline, num_shown=num_shown)
+
+
+def _opened(source: CaptureSource, place: int) -> tuple[str, DepthFrame | PointCloud | PcdataError]:
     sample_id = source.ids[place]
     try:
-        capture = source.load(sample_id)
+        return sample_id, source.load(sample_id)
     except PcdataError as error:
-        return Looked(sample_id, problem=f"cannot be read: {error}")
+        return sample_id, error
+
+
+def _looked(
+    opened: tuple[str, DepthFrame | PointCloud | PcdataError], *, pipeline: Compose | None, num_shown: int
+) -> Looked:
+    sample_id, capture = opened
+    if isinstance(capture, PcdataError):
+        return Looked(sample_id, problem=f"cannot be read: {capture}")
     overlap = overlap_of(capture) if isinstance(capture, DepthFrame) else None
     steps, problem = _steps(capture, pipeline)
     clouds = [(step, data) for step, data in steps if isinstance(data, PointCloud)]
