@@ -58,10 +58,11 @@ def validate_frame(frame: DepthFrame, *, limits: CaptureLimits | None = None) ->
 def validate_source(source: CaptureSource, *, limits: CaptureLimits | None = None) -> Iterator[SampleReport]:
     """Check every capture of a source, and compare it with those of its recording before it; yields a report for each.
 
-    One capture is held, and the next one is read meanwhile, so memory does not grow with their number. A capture that cannot be read gives a
-    report with a failed check, and the others follow. After a recording a last report (``whole``) judges over all its
-    captures together what single ones tell less surely: the registration of color and depth, and the direction of the
-    poses. Its sample id is :data:`WHOLE`; where sources were joined, ``NAME/*`` tells the recordings apart.
+    One capture is held while the next one is read, so memory does not grow with their number. A capture that cannot be
+    read gives a report with a failed check, and the others follow. After a recording a last report (``whole``) judges
+    over all its captures together what single ones tell less surely: the registration of color and depth, and the
+    direction of the poses. Its sample id is :data:`WHOLE`; where sources were joined, ``NAME/*`` tells the recordings
+    apart.
 
     Args:
         source: anything with ``ids`` and ``load``; captures on disk also have their files looked at.
