@@ -165,7 +165,7 @@ class _Series:
                 raise read.refused
         except PcdataError as error:
             return SampleReport(read.sample_id, (*found, check_of_error(error)), refused=True)
-        capture, views = read.capture, ()
+        capture, views = read.capture, tuple[str, ...]()
         if isinstance(capture, DepthFrame):
             views = tuple(view_names(capture.provenance, capture.num_views))
         for check, memory in self._checks:
