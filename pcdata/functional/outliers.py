@@ -12,7 +12,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_count, checked_length, checked_positive
 from pcdata.functional.image_grid import ImageGrid, checked_grid
-from pcdata.functional.nearest import nearest_chunks, pair_chunks
+from pcdata.functional.nearest import nearest_chunks, pair_chunks, rooted
 from pcdata.functional.radius import require_extent, squared_radius
 from pcdata.functional.rows import cloud_of_rows, counts_from_ptr
 
@@ -39,7 +39,8 @@ def statistical_outlier_mask(
 
     A point stays when 0 < mean < mu + std_ratio * sigma. ``mean`` is over its ``num_neighbors`` nearest points, itself
     included at distance 0 (all points, in a smaller cloud); mu is the average of the means over the cloud; sigma their
-    sample deviation, n - 1. All sums are float64.
+    sample deviation, n - 1. Distances are the float32 ones of :func:`knn`, all sums are float64: those of distances are
+    exact, in whatever order, where the nearest is more than a millionth of the farthest, so backends agree on means.
 
     As in Open3D: points with ``num_neighbors`` or more copies at one spot have mean 0, so they are outliers and add
     nothing to sigma; and where sigma cannot separate anything, all points are outliers: clouds of one or two points,
@@ -53,7 +54,7 @@ def statistical_outlier_mask(
     mean = torch.zeros(len(points), dtype=torch.float64, device=points.device)
     for query, squared, _ in nearest_chunks(points, ptr, num_neighbors, backend=backend):
         found = squared.isfinite()
-        distance = torch.where(found, squared.double().sqrt(), 0.0)
+        distance = torch.where(found, rooted(squared), 0.0).double()
         mean[query] = distance.sum(1) / found.sum(1)
     cloud, counts = cloud_of_rows(ptr), counts_from_ptr(ptr).double()
     average = _interleaved_sum(mean, ptr) / counts

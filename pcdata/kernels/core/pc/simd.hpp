@@ -90,27 +90,27 @@ inline DoubleRegister minimum(const DoubleRegister& a, const DoubleRegister& b) 
 inline DoubleRegister maximum(const DoubleRegister& a, const DoubleRegister& b) {
   return _mm512_maskz_max_pd(kAll8, a, b);
 }
-inline DoubleRegister square_root(const DoubleRegister& a) { return _mm512_maskz_sqrt_pd(kAll8, a); }
+inline FloatRegister square_root(const FloatRegister& a) { return _mm512_maskz_sqrt_ps(kAll16, a); }
 #elif defined(__AVX2__)
 inline FloatRegister minimum(const FloatRegister& a, const FloatRegister& b) { return _mm256_min_ps(a, b); }
 inline FloatRegister maximum(const FloatRegister& a, const FloatRegister& b) { return _mm256_max_ps(a, b); }
 inline DoubleRegister minimum(const DoubleRegister& a, const DoubleRegister& b) { return _mm256_min_pd(a, b); }
 inline DoubleRegister maximum(const DoubleRegister& a, const DoubleRegister& b) { return _mm256_max_pd(a, b); }
-inline DoubleRegister square_root(const DoubleRegister& a) { return _mm256_sqrt_pd(a); }
+inline FloatRegister square_root(const FloatRegister& a) { return _mm256_sqrt_ps(a); }
 #elif defined(__SSE2__)
 inline FloatRegister minimum(const FloatRegister& a, const FloatRegister& b) { return _mm_min_ps(a, b); }
 inline FloatRegister maximum(const FloatRegister& a, const FloatRegister& b) { return _mm_max_ps(a, b); }
 inline DoubleRegister minimum(const DoubleRegister& a, const DoubleRegister& b) { return _mm_min_pd(a, b); }
 inline DoubleRegister maximum(const DoubleRegister& a, const DoubleRegister& b) { return _mm_max_pd(a, b); }
-inline DoubleRegister square_root(const DoubleRegister& a) { return _mm_sqrt_pd(a); }
+inline FloatRegister square_root(const FloatRegister& a) { return _mm_sqrt_ps(a); }
 #elif defined(PC_NEON)
 // Its own minimum and maximum of NaN and a number are NaN.
-inline DoubleRegister square_root(const DoubleRegister& a) {
-  return reinterpret_cast<DoubleRegister>(vsqrtq_f64(reinterpret_cast<float64x2_t>(a)));
+inline FloatRegister square_root(const FloatRegister& a) {
+  return reinterpret_cast<FloatRegister>(vsqrtq_f32(reinterpret_cast<float32x4_t>(a)));
 }
 #else
-inline DoubleRegister square_root(DoubleRegister a) {
-  for (int i = 0; i < kLanes / 2; ++i) a[i] = std::sqrt(a[i]);
+inline FloatRegister square_root(FloatRegister a) {
+  for (int i = 0; i < kLanes; ++i) a[i] = std::sqrt(a[i]);
   return a;
 }
 #endif
@@ -238,6 +238,15 @@ inline bool any(const RegisterMask& mask) { return mask.bits() != 0; }
 inline int store_chosen(int32_t* to, const Int32Register& lanes, RegisterMask chosen) {
 #if defined(PC_AVX512)
   _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(chosen.native, native(lanes)));
+#else
+  int count = 0;
+  for (uint32_t bits = chosen.bits(); bits != 0; bits &= bits - 1) to[count++] = lanes[__builtin_ctz(bits)];
+#endif
+  return __builtin_popcount(chosen.bits());
+}
+inline int store_chosen(float* to, const FloatRegister& lanes, RegisterMask chosen) {
+#if defined(PC_AVX512)
+  _mm512_storeu_ps(to, _mm512_maskz_compress_ps(chosen.native, native(lanes)));
 #else
   int count = 0;
   for (uint32_t bits = chosen.bits(); bits != 0; bits &= bits - 1) to[count++] = lanes[__builtin_ctz(bits)];

@@ -1,13 +1,30 @@
 // Statistical outliers: the mean distance to the nearest neighbors, and which means are unusual for their cloud.
 //
 // Source: Rusu et al., Toward 3D point cloud based object maps, RAS 2008; edge cases as in Open3D.
-#include "pc/neighbors/batch_search.hpp"
+#include <cmath>
+
 #include "pc/neighbors/nearest_keys.hpp"
+#include "pc/neighbors/window_distances.hpp"
 
 namespace pc::neighbors {
 namespace {
 
-// Writes the mean distance from each query to its k nearest (fewer, in a smaller cloud), summed nearest first.
+// Sums of float32 distances in double are exact, so that their order does not matter, where the farthest is at most so
+// many times the nearest that is not at distance 0: with up to 2^8 of them, the last bit of the least is worth at least
+// 2^-53 of the sum.
+constexpr float kExactRange = 1 << 20;
+constexpr int kMost = NearestDistances::kMax;
+
+// The mean of so many distances, summed nearest first.
+double ordered_mean(float* squared, int count) {
+  std::sort(squared, squared + count);
+  double total = 0;
+  int found = 0;
+  for (; found < count && squared[found] < kInfinity; ++found) total += double{std::sqrt(squared[found])};
+  return total / found;
+}
+
+// Writes the mean distance from each query to its k nearest (fewer, in a smaller cloud), summed nearest first or as if.
 struct MeanDistance {
   int64_t k;
   double* mean;  // (N,)
@@ -18,12 +35,38 @@ struct MeanDistance {
     for (int i = 0; i < k; ++i) {
       const FloatPack squared = nearest.squared(i);
       const PackMask real = less(squared, FloatPack(kInfinity));
-      total = total + keep(real, square_root(widen(squared)));
+      total = total + keep(real, widen(square_root(squared)));
       found = found + keep(real, DoublePack(1.0));
     }
+    write(total / found, group.active, row);
+  }
+
+  // Of squared distances (k - 1, 16) in no order, the query itself left out.
+  void operator()(const Row* squared, PackMask lanes, const uint32_t* row) const {
+    DoublePack total(0.0);
+    FloatPack least(kInfinity), most(0.0f);
+    for (int i = 0; i < k - 1; ++i) {
+      const FloatPack distance = square_root(FloatPack::load(squared[i]));
+      least = minimum(distance, least);
+      most = maximum(distance, most);
+      total = total + widen(distance);
+    }
+    write(total / DoublePack(static_cast<double>(k)), lanes, row);
+    // Copies at distance 0 are as rare as distances of such a range, or too large for a float.
+    const PackMask exact = less_equal(most, least * FloatPack(kExactRange)) & less(most, FloatPack(kInfinity));
+    for (PackMask left = lanes & ~exact; left != 0; left &= left - 1) {
+      const int lane = __builtin_ctz(left);
+      float own[kMost] = {};  // the first is the query itself
+      for (int i = 0; i < k - 1; ++i) own[i + 1] = squared[i][lane];
+      mean[row[lane]] = ordered_mean(own, static_cast<int>(k));
+    }
+  }
+
+ private:
+  void write(const DoublePack& means, PackMask lanes, const uint32_t* row) const {
     alignas(64) double value[kQueries];
-    (total / found).store(value);
-    for (PackMask left = group.active; left != 0; left &= left - 1) {
+    means.store(value);
+    for (PackMask left = lanes; left != 0; left &= left - 1) {
       const int lane = __builtin_ctz(left);
       mean[row[lane]] = value[lane];
     }
@@ -56,8 +99,24 @@ void mark_outliers(const double* mean, int64_t count, double std_ratio, bool* ou
 }
 
 template <class Nearest>
-void mean_distances(const pc_context& context, const Clouds& clouds, const Grid* grid, const MeanDistance& task) {
-  BatchSearch<Nearest, MeanDistance>(context, task.k, kInfinity, task).run(clouds, grid);
+void mean_distances(const pc_context& context, const Clouds& clouds, const MeanDistance& task) {
+  BatchSearch<Nearest, MeanDistance>(context, task.k, kInfinity, task).run(clouds, nullptr);
+}
+
+// The same for a cloud that lies on a depth image.
+void mean_distances(const pc_context& context, const Clouds& clouds, const Grid& grid, int64_t b,
+                    const MeanDistance& task) {
+  const int64_t begin = clouds.ptr[b], end = clouds.ptr[b + 1], alone[2] = {begin, end};
+  const int k = static_cast<int>(task.k);
+  ScratchFrame scratch;  // each cloud gets its image in turn: memory is for the largest, not for all
+  OrganizedCloud cloud;
+  BatchSearch<NearestDistances, MeanDistance> search(context, k, kInfinity, task);
+  if (k < 2 ||
+      !cloud.build(context, scratch, clouds.points, grid, b, begin, end, WindowDistances<MeanDistance>::max_reach(k)))
+    return search.run({clouds.points, alone, 1}, nullptr);
+  Unproved* rest = scratch.take<Unproved>(end - begin);
+  const int64_t count = WindowDistances<MeanDistance>(cloud, k, task).run(context, scratch, end - begin, rest);
+  search.finish(scratch, clouds.points, cloud, begin, end, rest, count);
 }
 
 }  // namespace
@@ -71,12 +130,14 @@ PC_EXPORT int32_t pc_statistical_outliers(const pc_context* context, const float
   using namespace pc::neighbors;
   return guarded([&] {
     const Grid grid{pixel, width, camera};
-    const Grid* organized = pixel == nullptr ? nullptr : &grid;
     const MeanDistance task{num_neighbors, mean};
-    if (num_neighbors <= NearestDistances::kMax)
-      mean_distances<NearestDistances>(*context, {points, ptr, num_clouds}, organized, task);
+    const Clouds clouds{points, ptr, num_clouds};
+    if (num_neighbors > kMost)
+      mean_distances<NearestMany>(*context, clouds, task);
+    else if (pixel == nullptr)
+      mean_distances<NearestDistances>(*context, clouds, task);
     else
-      mean_distances<NearestMany>(*context, {points, ptr, num_clouds}, organized, task);
+      for (int64_t b = 0; b < num_clouds; ++b) mean_distances(*context, clouds, grid, b, task);
     parallel_for(*context, num_clouds, 1, [&](int64_t b, int64_t, int64_t) {
       mark_outliers(mean + ptr[b], ptr[b + 1] - ptr[b], std_ratio, outlier + ptr[b]);
     });

@@ -6,6 +6,12 @@
 
 namespace pc::neighbors {
 
+// A query without a proof, and the k-th squared distance that it has found: the tree need not look farther.
+struct Unproved {
+  uint32_t row;
+  float limit;
+};
+
 struct Clouds {
   const float* points;  // (N, 3)
   const int64_t* ptr;   // (B+1,)
@@ -66,6 +72,20 @@ class BatchSearch {
     });
   }
 
+  // Search for queries of an organized cloud, rows `begin` to `end`, that windows have left without a proof.
+  void finish(ScratchFrame& scratch, const float* points, const OrganizedCloud& cloud, int64_t begin, int64_t end,
+              const Unproved* unproved, int64_t count) {
+    if (count == 0) return;
+    if (count * kOneIn > end - begin) {
+      // The grid does not fit the points: near in the image need not be near in space.
+      const int64_t alone[2] = {begin, end};
+      LeafBuilder builder(context_, scratch, points, alone, 1);
+      const int64_t* unused;
+      return finish_by_tree(scratch, points, builder.without_copies(k_, unused), unproved, count);
+    }
+    finish_by_tree(scratch, points, cloud.tile_leaves(context_, scratch), unproved, count);
+  }
+
  private:
   struct Worker {
     Nearest nearest;
@@ -106,12 +126,6 @@ class BatchSearch {
     return reach;
   }
 
-  // A query without a proof, and the k-th distance that it has found: the tree need not look farther.
-  struct Unproved {
-    uint32_t row;
-    float limit;
-  };
-
   void by_windows(ScratchFrame& scratch, const Clouds& clouds, const Grid& grid, int64_t b) {
     const int64_t begin = clouds.ptr[b], end = clouds.ptr[b + 1];
     if (begin == end) return;
@@ -150,15 +164,7 @@ class BatchSearch {
         worker.task(search, group, worker.nearest, row);
       }
     });
-    const int64_t count = num_unproved.load();
-    if (count == 0) return;
-    if (count * kOneIn > end - begin) {
-      // The grid does not fit the points: near in the image need not be near in space.
-      LeafBuilder builder(context_, scratch, clouds.points, alone, 1);
-      const int64_t* unused;
-      return finish_by_tree(scratch, clouds.points, builder.without_copies(k_, unused), unproved, count);
-    }
-    finish_by_tree(scratch, clouds.points, cloud.tile_leaves(context_, scratch), unproved, count);
+    finish(scratch, clouds.points, cloud, begin, end, unproved, num_unproved.load());
   }
 
   void finish_by_tree(ScratchFrame& scratch, const float* rows, const Leaves& leaves, const Unproved* queries,

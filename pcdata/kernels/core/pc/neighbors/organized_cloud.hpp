@@ -131,6 +131,7 @@ class OrganizedCloud {
   const float* y() const { return image_[1]; }
   const float* z() const { return image_[2]; }
   uint32_t row(int64_t pixel) const { return row_of_pixel_[pixel]; }
+  const uint32_t* rows(int64_t pixel) const { return row_of_pixel_ + pixel; }
   const HalfSpaces& columns() const { return columns_; }
   const HalfSpaces& lines() const { return lines_; }
 

@@ -1,20 +1,12 @@
 // The search of a cloud that still lies on a depth image: a window of pixels, with proof that nothing nearer lies
-// outside.
-//
-// The proof. Let S be the least X/Z of all points in the columns from u+w+1 on, in the camera's frame, where Z > 0. All
-// of those points lie in the half-space X >= S Z, so a query left of it is at least (S Z0 - X0) / sqrt(1 + S^2) away
-// from them; likewise for the columns up to u-w-1 and for rows. If the k-th distance found in the window of half-width
-// w is less than all four, no point outside can matter. S is measured from the points, not computed from intrinsics, so
-// a grid that does not fit the points (or a lens that bends columns) can only make proofs fail, never make them wrong;
-// queries without a proof go to the box tree.
+// outside. Queries without a proof go to the box tree.
 #pragma once
 
 #include <algorithm>
 #include <cstdlib>
 #include <vector>
 
-#include "pc/neighbors/organized_cloud.hpp"
-#include "pc/neighbors/tree_search.hpp"
+#include "pc/neighbors/window_proof.hpp"
 
 namespace pc::neighbors {
 
@@ -61,14 +53,14 @@ class WindowSearch {
     u_ = u;
     v_ = v;
     for (int ring = 0; ring <= reach; ++ring) offer_ring(queries, ring, nearest);
-    const Place place(cloud_, queries);
+    const Place place(cloud_, queries, u, v);
     for (;; offer_ring(queries, ++reach, nearest)) {
       nearest.settle();
       reach_ = reach;
-      const PackMask proved = less(nearest.bound(), clear_within(place, reach)) & queries.active;
+      const PackMask proved = less(nearest.bound(), place.clear_within(reach)) & queries.active;
       if (proved == queries.active || reach == cloud_.max_reach()) return proved;
       // Rings cost all lanes: go on only for those that the largest window would prove.
-      if ((less(nearest.bound(), clear_within(place, cloud_.max_reach())) & queries.active & ~proved) == 0)
+      if ((less(nearest.bound(), place.clear_within(cloud_.max_reach())) & queries.active & ~proved) == 0)
         return proved;
     }
   }
@@ -89,18 +81,6 @@ class WindowSearch {
   uint32_t row_in_lane(uint32_t id, int lane) const { return cloud_.row(id + static_cast<uint32_t>(lane)); }
 
  private:
-  // The queries in the camera's frame, and how far rounding may have moved anything: a dozen roundings at most, each
-  // of half a unit in the 24th bit of the largest coordinate.
-  struct Place {
-    FloatPack x, y, z, slack;
-
-    Place(const OrganizedCloud& cloud, const QueryGroup& queries) : x(queries.x), y(queries.y), z(queries.z) {
-      cloud.camera().move(x, y, z);
-      const FloatPack zero(0.0f);
-      slack = (maximum(x, zero - x) + maximum(y, zero - y) + z) * FloatPack(1e-6f);
-    }
-  };
-
   template <class Nearest>
   void offer_ring(const QueryGroup& queries, int ring, Nearest& nearest) const {
     for (auto offset = rings_.begin(ring); offset != rings_.end(ring); ++offset) {
@@ -112,25 +92,7 @@ class WindowSearch {
     }
   }
 
-  // The squared distance within which every point is in the window, per lane.
-  FloatPack clear_within(const Place& at, int reach) const {
-    const HalfSpaces &columns = cloud_.columns(), &lines = cloud_.lines();
-    const int64_t right = u_ + reach + 1, left = u_ - reach - 1, below = v_ + reach + 1, above = v_ - reach - 1;
-    const FloatPack to_right =
-        FloatPack::load(columns.from_b + right) * at.z - FloatPack::load(columns.from_a + right) * at.x;
-    const FloatPack to_left =
-        FloatPack::load(columns.upto_a + left) * at.x - FloatPack::load(columns.upto_b + left) * at.z;
-    const FloatPack to_below = FloatPack(lines.from_b[below]) * at.z - FloatPack(lines.from_a[below]) * at.y;
-    const FloatPack to_above = FloatPack(lines.upto_a[above]) * at.y - FloatPack(lines.upto_b[above]) * at.z;
-    const FloatPack nearest_side = minimum(minimum(to_right, to_left), minimum(to_below, to_above));
-    const FloatPack clear = maximum(nearest_side - at.slack, FloatPack(0.0f));
-    return clear * clear * FloatPack(kMargin);
-  }
-
   int64_t pixel(const WindowRings::Offset& offset) const { return (v_ + offset.dv) * cloud_.stride() + u_ + offset.du; }
-
-  // Rounding of computed squared distances (4e-7), and motions that are rigid only to 1e-5 (ImageGrid requires it).
-  static constexpr float kMargin = 1.0f - 1e-4f;
 
   const OrganizedCloud& cloud_;
   const WindowRings& rings_;

@@ -1,0 +1,201 @@
+// The distances to the nearest points of a cloud on a depth image, sixteen pixels at a time.
+#pragma once
+
+#include "pc/neighbors/batch_search.hpp"
+#include "pc/neighbors/image_boxes.hpp"
+#include "pc/neighbors/sorted_columns.hpp"
+
+namespace pc::neighbors {
+
+// The smallest squared distances to pixels around sixteen queries, the queries themselves left out.
+//
+// A list per lane holds `wanted` numbers in whole blocks of rows, those before them -infinity. What is least of two
+// ascending lists is least of the pairs of one's first with the other's last, its second with the other's last but one,
+// ...; that rises and then falls, and is sorted again only when more follows.
+class WindowList {
+ public:
+  static constexpr int kMost = kMostBlocks * kBlockRows;
+
+  void start(int wanted) {
+    wanted_ = wanted;
+    blocks_ = (wanted + kBlockRows - 1) / kBlockRows;
+    for (int i = 0; i < before(); ++i) FloatPack(-kInfinity).store(list_[i]);
+    is_empty_ = is_sorted_ = true;
+  }
+
+  // Take the squared distances body(0), ... body(count - 1).
+  template <class Body>
+  void take(int count, Body body) {
+    for (int from = 0; from < count; from += blocks_ * kBlockRows) {
+      const int some = std::min(count - from, blocks_ * kBlockRows), rows = (some + kBlockRows - 1) / kBlockRows;
+      for (int i = 0; i < some; ++i) body(from + i).store(taken_[i]);
+      for (int i = some; i < rows * kBlockRows; ++i) FloatPack(kInfinity).store(taken_[i]);
+      sort_columns(taken_, rows);
+      merge(rows * kBlockRows);
+    }
+  }
+
+  FloatPack bound() const {
+    if (is_sorted_) return FloatPack::load(list_[size() - 1]);
+    FloatPack most(-kInfinity);
+    for (int i = before(); i < size(); ++i) most = maximum(FloatPack::load(list_[i]), most);
+    return most;
+  }
+  // (wanted, 16) in no order.
+  const Row* squared() const { return list_ + before(); }
+
+ private:
+  int size() const { return blocks_ * kBlockRows; }
+  int before() const { return size() - wanted_; }
+
+  void merge(int count) {
+    if (is_empty_) {
+      for (int i = 0; i < wanted_; ++i)
+        (i < count ? FloatPack::load(taken_[i]) : FloatPack(kInfinity)).store(list_[before() + i]);
+      is_empty_ = false;
+      return;
+    }
+    if (!is_sorted_) sort_rising_falling(list_, blocks_);
+    for (int i = 0; i < count; ++i) {
+      Row& own = list_[size() - 1 - i];
+      minimum(FloatPack::load(own), FloatPack::load(taken_[i])).store(own);
+    }
+    is_sorted_ = false;
+  }
+
+  alignas(64) Row list_[kMost];
+  alignas(64) Row taken_[kMost];
+  int wanted_ = 0, blocks_ = 0;
+  bool is_empty_ = true, is_sorted_ = true;
+};
+
+// Sixteen queries whose neighbors were found one by one.
+struct Stragglers {
+  alignas(64) float squared[StragglerSearch::kMost][kQueries];
+  uint32_t row[kQueries];
+  int number = 0, longest = 0, length[kQueries];
+
+  // Take the squared distances below a bound, the query itself among them; the bound stands in for those that are
+  // missing.
+  void add(uint32_t query, const StragglerSearch& search, int others) {
+    bool is_itself = true;
+    int count = 0;
+    for (int i = 0; i < search.count(); ++i) {
+      squared[count][number] = search.squared()[i];
+      const bool leave_out = is_itself && search.squared()[i] == 0;
+      is_itself &= !leave_out;
+      count += !leave_out;
+    }
+    for (; count < others; ++count) squared[count][number] = search.bound();
+    row[number] = query;
+    length[number++] = count;
+    longest = std::max(longest, count);
+  }
+};
+
+// Calls for every query of the cloud, in no order, task(squared, lanes, row) with the squared distances to its nearest
+// others: (k - 1, 16) in no order, infinity where there are fewer. Those that would take too much work it returns.
+template <class Task>
+class WindowDistances {
+ public:
+  // The half-width that windows have at most.
+  static int max_reach(int k) { return first_reach(k) + kMoreRings; }
+
+  WindowDistances(const OrganizedCloud& cloud, int k, const Task& task)
+      : cloud_(cloud), k_(k), task_(task), rings_(max_reach(k)) {}
+
+  int64_t run(const pc_context& context, ScratchFrame& scratch, int64_t count, Unproved* rest) {
+    const ImageBoxes boxes(context, scratch, cloud_);
+    std::atomic<int64_t> num_rest{0}, work{0};
+    parallel_for(context, cloud_.height(), kLinesPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      WindowList list;
+      StragglerSearch search(cloud_, boxes, k_);
+      Stragglers stragglers;
+      for (int64_t v = first; v < last; ++v)
+        for (int64_t u = 0; u < cloud_.width(); u += kQueries) {
+          const int64_t at = v * cloud_.stride() + u;
+          const QueryGroup queries(cloud_.x() + at, cloud_.y() + at, cloud_.z() + at);
+          if (queries.active == 0) continue;
+          const Place place(cloud_, queries, u, v);
+          const PackMask proved = search_windows(queries, place, at, list);
+          if (proved != 0) task_(list.squared(), proved, cloud_.rows(at));
+          PackMask left = queries.active & ~proved;
+          if (left == 0) continue;
+          // The query itself is nearest, so that the k-1-th of the others is the k-th.
+          const FloatPack bounds = list.bound();
+          for (; left != 0; left &= left - 1) {
+            const int lane = __builtin_ctz(left);
+            const uint32_t row = cloud_.row(at + lane);
+            const float bound = bounds[lane];
+            if (work.load(std::memory_order_relaxed) > kWorkPerPoint * count) {
+              rest[num_rest.fetch_add(1, std::memory_order_relaxed)] = {row, bound};
+              continue;
+            }
+            const int64_t before = search.work();
+            search.run(queries, lane, place.rectangle(lane, bound), v, bound);
+            work.fetch_add(search.work() - before, std::memory_order_relaxed);
+            stragglers.add(row, search, k_ - 1);
+            if (stragglers.number == kQueries) finish(stragglers, list);
+          }
+        }
+      if (stragglers.number != 0) finish(stragglers, list);
+    });
+    return num_rest.load();
+  }
+
+ private:
+  static constexpr int64_t kLinesPerPiece = 4;
+  static constexpr int kMoreRings = 3;
+  static constexpr int kWorth = 2;             // lanes for which a further ring costs less than searches of their own
+  static constexpr int64_t kWorkPerPoint = 4;  // registers of pixels looked at for stragglers, per point of the cloud
+
+  static int first_reach(int k) {
+    int reach = 1;
+    while ((2 * reach + 1) * (2 * reach + 1) < k) ++reach;
+    return reach;
+  }
+
+  void finish(Stragglers& stragglers, WindowList& list) const {
+    for (int lane = 0; lane < stragglers.number; ++lane)
+      for (int i = stragglers.length[lane]; i < stragglers.longest; ++i) stragglers.squared[i][lane] = kInfinity;
+    list.start(k_ - 1);
+    list.take(stragglers.longest, [&](int i) { return FloatPack::load(stragglers.squared[i]); });
+    task_(list.squared(), (PackMask{1} << stragglers.number) - 1, stragglers.row);
+    stragglers.number = stragglers.longest = 0;
+  }
+
+  PackMask search_windows(const QueryGroup& queries, const Place& place, int64_t at, WindowList& list) const {
+    list.start(k_ - 1);
+    int reach = first_reach(k_);
+    take(queries, at, rings_.begin(1), rings_.end(reach), list);
+    for (;;) {
+      const FloatPack bound = list.bound();
+      const PackMask proved = less(bound, place.clear_within(reach)) & queries.active, open = queries.active & ~proved;
+      if (open == 0 || reach == max_reach(k_)) return proved;
+      const PackMask hopeful = less(bound, place.clear_within(max_reach(k_))) & open;
+      const PackMask lost = open & ~less(bound, FloatPack(kInfinity));
+      if (__builtin_popcount(hopeful) < kWorth && lost == 0) return proved;
+      ++reach;
+      take(queries, at, rings_.begin(reach), rings_.end(reach), list);
+    }
+  }
+
+  void take(const QueryGroup& queries, int64_t at, const WindowRings::Offset* begin, const WindowRings::Offset* end,
+            WindowList& list) const {
+    const float *xs = cloud_.x() + at, *ys = cloud_.y() + at, *zs = cloud_.z() + at;
+    const int64_t stride = cloud_.stride();
+    const FloatPack x = queries.x, y = queries.y, z = queries.z;
+    list.take(static_cast<int>(end - begin), [=](int i) __attribute__((always_inline)) {
+      const int64_t other = begin[i].dv * stride + begin[i].du;
+      return squared_length(FloatPack::load(xs + other) - x, FloatPack::load(ys + other) - y,
+                            FloatPack::load(zs + other) - z);
+    });
+  }
+
+  const OrganizedCloud& cloud_;
+  int k_;
+  const Task& task_;
+  WindowRings rings_;
+};
+
+}  // namespace pc::neighbors
