@@ -23,6 +23,13 @@ struct Grid {
 struct CameraFrame {
   const double* matrix;  // (4, 4), or null for none
 
+  // Clouds that were never moved come with the identity.
+  static CameraFrame of(const double* matrix) {
+    bool moves = false;
+    for (int i = 0; matrix != nullptr && i < 12; ++i) moves |= matrix[i] != (i % 5 == 0 ? 1.0 : 0.0);
+    return {moves ? matrix : nullptr};
+  }
+
   // Sixteen points; every coordinate is rounded once, at the end.
   void move(FloatPack& x, FloatPack& y, FloatPack& z) const {
     if (matrix == nullptr) return;
@@ -80,8 +87,8 @@ class OrganizedCloud {
   bool build(const pc_context& context, ScratchFrame& scratch, const float* points, const Grid& grid, int64_t cloud,
              int64_t begin, int64_t end, int max_reach) {
     max_reach_ = max_reach;
-    camera_ = {grid.camera == nullptr ? nullptr : grid.camera + 16 * cloud};
-    if (!measure(context, grid, begin, end)) return false;
+    camera_ = CameraFrame::of(grid.camera == nullptr ? nullptr : grid.camera + 16 * cloud);
+    if (!measure(context, scratch, grid, begin, end)) return false;
     const int64_t rows = height_ + 2 * max_reach;
     stride_ = (width_ + max_reach + kQueries - 1) / kQueries * kQueries + kQueries + 2 * max_reach;
     if (rows * stride_ > kMaxPixelsPerPoint * (end - begin) || rows * stride_ >= int64_t{kNoId}) return false;
@@ -89,18 +96,7 @@ class OrganizedCloud {
     float* room = scratch.take<float>(3 * rows * stride_);
     for (int axis = 0; axis < 3; ++axis) image_[axis] = room + axis * rows * stride_ + origin_;
     row_of_pixel_ = scratch.take<uint32_t>(rows * stride_) + origin_;
-    parallel_for(context, rows, kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
-      for (int axis = 0; axis < 3; ++axis)
-        std::fill(image_[axis] - origin_ + first * stride_, image_[axis] - origin_ + last * stride_, kInfinity);
-    });
-    parallel_for(context, end - begin, kPointsPerPiece, [&](int64_t first, int64_t last, int64_t) {
-      for_pixels(grid, begin + first, begin + last, [&](int64_t i, int64_t u, int64_t v) {
-        const int64_t at = (v - first_row_) * stride_ + (u - first_column_);
-        for (int axis = 0; axis < 3; ++axis) image_[axis][at] = points[3 * i + axis];
-        row_of_pixel_[at] = static_cast<uint32_t>(i);
-      });
-    });
-    return measure_slopes(context, scratch);
+    return lay_out(context, scratch, points, grid);
   }
 
   // The cloud as leaves of 4x4 pixels, in Morton order within tiles of 64x64: near in the image is mostly near in
@@ -140,7 +136,7 @@ class OrganizedCloud {
   static constexpr int64_t kMaxPixelsPerPoint = 4;
   static constexpr int64_t kTile = 64, kLeafSide = 4;
   static constexpr int64_t kRowsPerPiece = 16;
-  static constexpr int64_t kPointsPerPiece = 1 << 14;
+  static constexpr int64_t kLinesPerPiece = 64;
   static constexpr float kMinDepth = 1e-30f, kMaxSlope = 1e18f;  // so that no slope overflows
 
   // A leaf may reach over the edge of the image, into the margin.
@@ -154,45 +150,71 @@ class OrganizedCloud {
     }
   }
 
-  template <class Body>
-  static void for_pixels(const Grid& grid, int64_t begin, int64_t end, Body&& body) {
-    int64_t v = begin < end ? grid.pixel[begin] / grid.width : 0;
-    for (int64_t i = begin; i < end; ++i) {
-      int64_t u = grid.pixel[i] - v * grid.width;
-      if (u >= grid.width) {
-        v = grid.pixel[i] / grid.width;
-        u = grid.pixel[i] - v * grid.width;
-      }
-      body(i, u, v);
-    }
-  }
-
-  // The rectangle of pixels that the cloud covers.
-  bool measure(const pc_context& context, const Grid& grid, int64_t begin, int64_t end) {
+  // The rectangle of pixels that the cloud covers, and where its lines begin.
+  bool measure(const pc_context& context, ScratchFrame& scratch, const Grid& grid, int64_t begin, int64_t end) {
     if (begin == end) return false;
     first_row_ = grid.pixel[begin] / grid.width;
     height_ = grid.pixel[end - 1] / grid.width - first_row_ + 1;
-    struct alignas(64) ColumnRange {
-      int64_t least, most;
-    };
-    std::vector<ColumnRange> ranges(static_cast<size_t>(std::max(context.threads, 1)), ColumnRange{grid.width, -1});
-    parallel_for(context, end - begin, kPointsPerPiece, [&](int64_t first, int64_t last, int64_t thread) {
-      ColumnRange range = ranges[static_cast<size_t>(thread)];
-      for_pixels(grid, begin + first, begin + last,
-                 [&](int64_t, int64_t u, int64_t) { range = {std::min(range.least, u), std::max(range.most, u)}; });
-      ranges[static_cast<size_t>(thread)] = range;
+    if (height_ > kMaxPixelsPerPoint * (end - begin)) return false;
+    int64_t* start = scratch.take<int64_t>(height_ + 1);
+    line_start_ = start;
+    parallel_for(context, height_ + 1, kLinesPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      for (int64_t v = first; v < last; ++v)
+        start[v] = std::lower_bound(grid.pixel + (v == first ? begin : start[v - 1]), grid.pixel + end,
+                                    (first_row_ + v) * grid.width) -
+                   grid.pixel;
     });
     first_column_ = grid.width;
     int64_t last_column = 0;
-    for (const ColumnRange& range : ranges) {
-      first_column_ = std::min(first_column_, range.least);
-      last_column = std::max(last_column, range.most);
+    for (int64_t v = 0; v < height_; ++v) {
+      if (start[v] == start[v + 1]) continue;
+      const int64_t line = (first_row_ + v) * grid.width;
+      first_column_ = std::min(first_column_, grid.pixel[start[v]] - line);
+      last_column = std::max(last_column, grid.pixel[start[v + 1] - 1] - line);
     }
     width_ = last_column - first_column_ + 1;
     return true;
   }
 
-  bool measure_slopes(const pc_context& context, ScratchFrame& scratch) {
+  // Write line v of the image, or one of the margin: points where there are any, infinity elsewhere.
+  void lay_line(const float* points, const Grid& grid, int64_t v) {
+    const int64_t end = stride_ - max_reach_;
+    int64_t next = -max_reach_;  // column to be written
+    const auto clear_up_to = [&](int64_t u) {
+      for (float* axis : image_) std::fill(axis + v * stride_ + next, axis + v * stride_ + u, kInfinity);
+      next = u;
+    };
+    if (v >= 0 && v < height_) {
+      const int64_t line = (first_row_ + v) * grid.width + first_column_, last = line_start_[v + 1];
+      for (int64_t i = line_start_[v]; i < last;) {
+        const int64_t run = run_of(grid.pixel + i, last - i), u = grid.pixel[i] - line, at = v * stride_ + u;
+        clear_up_to(u);
+        lay_run(points + 3 * i, run, image_[0] + at, image_[1] + at, image_[2] + at);
+        for (int64_t j = 0; j < run; ++j) row_of_pixel_[at + j] = static_cast<uint32_t>(i + j);
+        next = u + run;
+        i += run;
+      }
+    }
+    clear_up_to(end);
+  }
+  // How many of so many rising pixels follow one another.
+  static int64_t run_of(const int64_t* pixel, int64_t count) {
+    int64_t run = 1;
+    for (int64_t step = 64; step > 0; step /= 4)
+      while (run + step <= count && pixel[run + step - 1] == pixel[0] + run + step - 1) run += step;
+    return run;
+  }
+  static void lay_run(const float* __restrict points, int64_t count, float* __restrict x, float* __restrict y,
+                      float* __restrict z) {
+    for (int64_t i = 0; i < count; ++i) {
+      x[i] = points[3 * i];
+      y[i] = points[3 * i + 1];
+      z[i] = points[3 * i + 2];
+    }
+  }
+
+  // Write the image and measure its slopes; false where a point is not in front of the camera.
+  bool lay_out(const pc_context& context, ScratchFrame& scratch, const float* points, const Grid& grid) {
     const int64_t bands = (height_ + kRowsPerPiece - 1) / kRowsPerPiece;
     const int64_t columns = (width_ + kQueries - 1) / kQueries * kQueries;
     float* column = scratch.take<float>(2 * bands * columns);  // least, then most, of each band
@@ -203,9 +225,16 @@ class OrganizedCloud {
       std::fill(least, most, kInfinity);
       std::fill(most, most + columns, -kInfinity);
       bool fine = true;
-      for (int64_t v = band * kRowsPerPiece, end = std::min(height_, v + kRowsPerPiece); v < end; ++v)
+      const int64_t first = band * kRowsPerPiece, last = std::min(height_, first + kRowsPerPiece);
+      for (int64_t v = first; v < last; ++v) {
+        lay_line(points, grid, v);
         fine &= slopes_of_line(v, least, most, line[v], line[height_ + v]);
+      }
       if (!fine) in_front.store(false, std::memory_order_relaxed);
+      for (int64_t margin = 1; margin <= max_reach_; ++margin) {
+        if (first == 0) lay_line(points, grid, -margin);
+        if (last == height_) lay_line(points, grid, height_ - 1 + margin);
+      }
     });
     if (!in_front.load()) return false;
     for (int64_t band = 1; band < bands; ++band)
@@ -246,6 +275,7 @@ class OrganizedCloud {
 
   int64_t first_row_ = 0, first_column_ = 0, width_ = 0, height_ = 0, stride_ = 0, origin_ = 0;
   int max_reach_ = 0;
+  const int64_t* line_start_ = nullptr;  // (height + 1,) the first row of each line
   CameraFrame camera_{nullptr};
   float* image_[3] = {};
   uint32_t* row_of_pixel_ = nullptr;

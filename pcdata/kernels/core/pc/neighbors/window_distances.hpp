@@ -26,21 +26,22 @@ class WindowList {
   // Take the squared distances body(0), ... body(count - 1).
   template <class Body>
   void take(int count, Body body) {
-    for (int from = 0; from < count; from += blocks_ * kBlockRows) {
-      const int some = std::min(count - from, blocks_ * kBlockRows), rows = (some + kBlockRows - 1) / kBlockRows;
-      for (int i = 0; i < some; ++i) body(from + i).store(taken_[i]);
-      for (int i = some; i < rows * kBlockRows; ++i) FloatPack(kInfinity).store(taken_[i]);
-      sort_columns(taken_, rows);
-      merge(rows * kBlockRows);
+    for (int from = 0; from < count; from += size()) {
+      const int some = std::min(count - from, size()), rows = (some + kBlockRows - 1) / kBlockRows * kBlockRows;
+      Row* taken = is_empty_ ? list_ + before() : taken_;
+      for (int i = 0; i < some; ++i) body(from + i).store(taken[i]);
+      for (int i = some; i < (is_empty_ ? size() : rows); ++i) FloatPack(kInfinity).store(taken[i]);
+      sort_columns(taken, rows / kBlockRows);
+      if (is_empty_)
+        bound_ = FloatPack::load(list_[size() - 1]);
+      else
+        merge(std::min(rows, wanted_));
+      is_empty_ = false;
     }
   }
 
-  FloatPack bound() const {
-    if (is_sorted_) return FloatPack::load(list_[size() - 1]);
-    FloatPack most(-kInfinity);
-    for (int i = before(); i < size(); ++i) most = maximum(FloatPack::load(list_[i]), most);
-    return most;
-  }
+  // The largest that is wanted.
+  const FloatPack& bound() const { return bound_; }
   // (wanted, 16) in no order.
   const Row* squared() const { return list_ + before(); }
 
@@ -49,22 +50,21 @@ class WindowList {
   int before() const { return size() - wanted_; }
 
   void merge(int count) {
-    if (is_empty_) {
-      for (int i = 0; i < wanted_; ++i)
-        (i < count ? FloatPack::load(taken_[i]) : FloatPack(kInfinity)).store(list_[before() + i]);
-      is_empty_ = false;
-      return;
-    }
     if (!is_sorted_) sort_rising_falling(list_, blocks_);
+    FloatPack most = count < wanted_ ? FloatPack::load(list_[size() - 1 - count]) : FloatPack(-kInfinity);
     for (int i = 0; i < count; ++i) {
       Row& own = list_[size() - 1 - i];
-      minimum(FloatPack::load(own), FloatPack::load(taken_[i])).store(own);
+      const FloatPack less = minimum(FloatPack::load(own), FloatPack::load(taken_[i]));
+      less.store(own);
+      most = maximum(less, most);
     }
+    bound_ = most;
     is_sorted_ = false;
   }
 
-  alignas(64) Row list_[kMost];
+  alignas(64) Row list_[kMost + kBlockRows];  // the first chunk may stand up to seven rows later
   alignas(64) Row taken_[kMost];
+  FloatPack bound_{kInfinity};
   int wanted_ = 0, blocks_ = 0;
   bool is_empty_ = true, is_sorted_ = true;
 };
