@@ -23,21 +23,38 @@ class WindowList {
     is_empty_ = is_sorted_ = true;
   }
 
-  // Take the squared distances body(0), ... body(count - 1).
+  // Take the squared distances body(0), ... body(count - 1); those that could not change any of the lanes may be
+  // missed.
   template <class Body>
-  void take(int count, Body body) {
-    for (int from = 0; from < count; from += size()) {
-      const int some = std::min(count - from, size()), rows = (some + kBlockRows - 1) / kBlockRows * kBlockRows;
-      Row* taken = is_empty_ ? list_ + before() : taken_;
-      for (int i = 0; i < some; ++i) body(from + i).store(taken[i]);
-      for (int i = some; i < (is_empty_ ? size() : rows); ++i) FloatPack(kInfinity).store(taken[i]);
-      sort_columns(taken, rows / kBlockRows);
-      if (is_empty_)
-        bound_ = FloatPack::load(list_[size() - 1]);
-      else
-        merge(std::min(rows, wanted_));
+  void take(int count, PackMask lanes, Body body) {
+    int next = 0;
+    if (is_empty_) {
       is_empty_ = false;
+      for (; next < std::min(count, size()); ++next) body(next).store(list_[before() + next]);
+      for (int i = next; i < size(); ++i) FloatPack(kInfinity).store(list_[before() + i]);
+      sort_columns(list_ + before(), (next + kBlockRows - 1) / kBlockRows);
+      bound_ = FloatPack::load(list_[size() - 1]);
     }
+    if (__builtin_popcount(lanes) > kFew) {
+      while (next < count) {
+        const int some = std::min(count - next, size());
+        for (int i = 0; i < some; ++i) body(next + i).store(taken_[i]);
+        next += some;
+        merge(some);
+      }
+      return;
+    }
+    int taken = 0;
+    for (; next < count; ++next) {
+      const FloatPack squared = body(next);
+      squared.store(taken_[taken]);
+      taken += (less(squared, bound_) & lanes) != 0;
+      if (taken == size()) {
+        merge(taken);
+        taken = 0;
+      }
+    }
+    if (taken != 0) merge(taken);
   }
 
   // The largest that is wanted.
@@ -46,17 +63,23 @@ class WindowList {
   const Row* squared() const { return list_ + before(); }
 
  private:
+  // Lanes for which it pays to look whether a number matters before it is sorted.
+  static constexpr int kFew = 10;
+
   int size() const { return blocks_ * kBlockRows; }
   int before() const { return size() - wanted_; }
 
-  void merge(int count) {
+  void merge(int taken) {
+    const int blocks = (taken + kBlockRows - 1) / kBlockRows, count = std::min(blocks * kBlockRows, wanted_);
+    for (int i = taken; i < blocks * kBlockRows; ++i) FloatPack(kInfinity).store(taken_[i]);
+    sort_columns(taken_, blocks);
     if (!is_sorted_) sort_rising_falling(list_, blocks_);
     FloatPack most = count < wanted_ ? FloatPack::load(list_[size() - 1 - count]) : FloatPack(-kInfinity);
     for (int i = 0; i < count; ++i) {
       Row& own = list_[size() - 1 - i];
-      const FloatPack less = minimum(FloatPack::load(own), FloatPack::load(taken_[i]));
-      less.store(own);
-      most = maximum(less, most);
+      const FloatPack lesser = minimum(FloatPack::load(own), FloatPack::load(taken_[i]));
+      lesser.store(own);
+      most = maximum(lesser, most);
     }
     bound_ = most;
     is_sorted_ = false;
@@ -145,7 +168,7 @@ class WindowDistances {
 
  private:
   static constexpr int64_t kLinesPerPiece = 4;
-  static constexpr int kMoreRings = 3;
+  static constexpr int kMoreRings = 8;
   static constexpr int kWorth = 2;             // lanes for which a further ring costs less than searches of their own
   static constexpr int64_t kWorkPerPoint = 4;  // registers of pixels looked at for stragglers, per point of the cloud
 
@@ -159,7 +182,7 @@ class WindowDistances {
     for (int lane = 0; lane < stragglers.number; ++lane)
       for (int i = stragglers.length[lane]; i < stragglers.longest; ++i) stragglers.squared[i][lane] = kInfinity;
     list.start(k_ - 1);
-    list.take(stragglers.longest, [&](int i) { return FloatPack::load(stragglers.squared[i]); });
+    list.take(stragglers.longest, ~PackMask{0}, [&](int i) { return FloatPack::load(stragglers.squared[i]); });
     task_(list.squared(), (PackMask{1} << stragglers.number) - 1, stragglers.row);
     stragglers.number = stragglers.longest = 0;
   }
@@ -167,7 +190,7 @@ class WindowDistances {
   PackMask search_windows(const QueryGroup& queries, const Place& place, int64_t at, WindowList& list) const {
     list.start(k_ - 1);
     int reach = first_reach(k_);
-    take(queries, at, rings_.begin(1), rings_.end(reach), list);
+    take(queries, queries.active, at, rings_.begin(1), rings_.end(reach), list);
     for (;;) {
       const FloatPack bound = list.bound();
       const PackMask proved = less(bound, place.clear_within(reach)) & queries.active, open = queries.active & ~proved;
@@ -176,16 +199,16 @@ class WindowDistances {
       const PackMask lost = open & ~less(bound, FloatPack(kInfinity));
       if (__builtin_popcount(hopeful) < kWorth && lost == 0) return proved;
       ++reach;
-      take(queries, at, rings_.begin(reach), rings_.end(reach), list);
+      take(queries, open, at, rings_.begin(reach), rings_.end(reach), list);
     }
   }
 
-  void take(const QueryGroup& queries, int64_t at, const WindowRings::Offset* begin, const WindowRings::Offset* end,
-            WindowList& list) const {
+  void take(const QueryGroup& queries, PackMask lanes, int64_t at, const WindowRings::Offset* begin,
+            const WindowRings::Offset* end, WindowList& list) const {
     const float *xs = cloud_.x() + at, *ys = cloud_.y() + at, *zs = cloud_.z() + at;
     const int64_t stride = cloud_.stride();
     const FloatPack x = queries.x, y = queries.y, z = queries.z;
-    list.take(static_cast<int>(end - begin), [=](int i) __attribute__((always_inline)) {
+    list.take(static_cast<int>(end - begin), lanes, [=](int i) __attribute__((always_inline)) {
       const int64_t other = begin[i].dv * stride + begin[i].du;
       return squared_length(FloatPack::load(xs + other) - x, FloatPack::load(ys + other) - y,
                             FloatPack::load(zs + other) - z);
