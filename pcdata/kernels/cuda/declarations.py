@@ -21,6 +21,7 @@ from pcdata.files.opening import read_text
 SOURCES = Path(__file__).parents[1] / "core"
 KINDS = {"": "apart", "BLOCK_": "in blocks", "GRID_": "all together"}
 
+_DEFINED = re.compile(r"^#define (\w+_PARAMETERS)\b((?:[^\n]*\\\n)*[^\n]*)", re.MULTILINE)
 _KERNEL = re.compile(r"^PC_(|BLOCK_|GRID_)KERNEL\((\w+),\s*([^{]*?)\)\s*\{", re.MULTILINE)
 _DTYPES = {
     "float*": (torch.float32,),
@@ -68,6 +69,8 @@ def declared(text: str, theme: str) -> list[Kernel]:
         ValueError: an argument is no pointer, int64_t or double.
     """
     text = re.sub(r"//[^\n]*", "", text)
+    for name, parameters in _DEFINED.findall(text):  # that several kernels share
+        text = text.replace(f", {name})", f", {parameters.replace(chr(92), ' ')})")
     return [
         Kernel(name, theme, KINDS[kind], tuple(_parameter(name, one) for one in listed.split(",")))
         for kind, name, listed in _KERNEL.findall(text)
@@ -122,7 +125,7 @@ def values_of(kernel: Kernel, arguments: Sequence[Any], device_type: str) -> lis
 
 
 def _parameter(kernel: str, text: str) -> Parameter:
-    kind, _, name = text.replace("const ", "").strip().rpartition(" ")
+    kind, _, name = re.sub(r"\s*\*\s*", "* ", text.replace("const ", "")).strip().rpartition(" ")
     if kind not in _DTYPES and kind not in _NUMBERS:
         raise ValueError(f"{kernel}: arguments are pointers, int64_t or double, not {text.strip()!r}")
     return Parameter(name, _DTYPES.get(kind, ()), _NUMBERS.get(kind))

@@ -14,6 +14,8 @@ pytestmark = pytest.mark.skipif(harness.unavailable() is not None, reason=str(ha
 harness.register()
 
 SERVED = [example for example in EXAMPLES if OPERATIONS[example.name].serves(harness.BACKEND)]
+# Clouds that kernels do not know: other than three coordinates.
+LEFT_TO_REFERENCES = {"in_six_dimensions"}
 each_served = pytest.mark.parametrize(
     "example", SERVED, ids=[f"{example.name}-{example.cloud.__name__}" for example in SERVED]
 )
@@ -52,7 +54,7 @@ def test_on_a_device_auto_takes_the_kernels_and_results_stay_there(example, monk
     expected = call(example, arguments, backend="torch")
     launcher = harness.use(0)
     found = call(example, {key: value.to(device) for key, value in arguments.items()})
-    assert launcher.started
+    assert launcher.started or example.cloud.__name__ in LEFT_TO_REFERENCES
     for one, wanted in zip(found, expected, strict=True):
         assert one.device.type == device.type
         torch.testing.assert_close(pretend_device.host(one), wanted, rtol=1e-6, atol=1e-6)

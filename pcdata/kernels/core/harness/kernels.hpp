@@ -1,5 +1,8 @@
 // Every kernel: a new header of pc/gpu with kernels joins here.
 #pragma once
 
+#include "pc/gpu/box_tree.hpp"
 #include "pc/gpu/cell_table.hpp"
+#include "pc/gpu/farthest.hpp"
+#include "pc/gpu/nearest.hpp"
 #include "pc/gpu/radius.hpp"

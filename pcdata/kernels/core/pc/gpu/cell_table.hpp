@@ -81,12 +81,6 @@ struct Cells {
   }
 };
 
-// A point in the order of the cells, with its row.
-struct alignas(16) Placed {
-  float x, y, z;
-  int32_t row;
-};
-
 // Put every row into its cell: its place in the table, and how many of that cell came before it; both are skipped if
 // `needed` (1,) is 0. Sets `far` (1,) if a point lies so far out that its cell is not certain.
 PC_KERNEL(pc_insert_cells, const float* points, const int64_t* ptr, int64_t clouds, int64_t rows, double side,

@@ -6,6 +6,12 @@
 
 namespace pc::gpu {
 
+// A point with its row, in an order other than that of the rows.
+struct alignas(16) Placed {
+  float x, y, z;
+  int32_t row;
+};
+
 // The cloud of a row.
 PC_HD int64_t cloud_of(const int64_t* ptr, int64_t clouds, int64_t row) {
   int64_t low = 0, high = clouds;  // ptr[low] <= row < ptr[high]

@@ -1,0 +1,46 @@
+"""Farthest points: a block for each of many clouds, all blocks for a large one."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+import pcdata.functional.sampling  # noqa: F401 - the functions must be registered before their kernels
+from pcdata.contracts.dispatch import INNER, kernel
+from pcdata.functional.rows import ptr_from_counts
+from pcdata.kernels.cuda.launching import launcher_of
+
+_MOST_ROWS = 2**32 - 2  # a key counts them down in 32 bits
+_LARGE = 1 << 15  # points a cloud, from which all blocks sample one together: meeting costs more than within a block
+_WARP, _MOST_THREADS = 32, 1024
+
+
+@kernel("farthest_rows", "cuda")
+def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
+    """Pick in one kernel, or in one for each cloud where these are large; no pick waits for the host."""
+    clouds, (rows, width), device = len(counts), points.shape, points.device
+    if not width or rows > _MOST_ROWS:
+        fallen: Tensor = INNER["farthest_rows"].reference(points, ptr, counts)
+        return fallen
+    launcher = launcher_of(points)
+    points, ptr = points.detach().contiguous(), ptr.contiguous()
+    picks = torch.empty(sum(counts), dtype=torch.int64, device=device)
+    nearest = torch.empty(rows, dtype=torch.float32, device=device)
+    each = rows // max(1, clouds)
+    if each < _LARGE:
+        block = min(_MOST_THREADS, _WARP << max(0, (each - 1) // _WARP).bit_length())
+        picks_ptr = ptr_from_counts(counts, device=device)
+        launcher.launch_blocks("pc_sample_clouds", clouds, points, ptr, width, picks_ptr, nearest, picks, block=block)
+        return picks
+    best = torch.zeros(sum(counts), dtype=torch.int64, device=device)
+    arrivals = torch.zeros(clouds, dtype=torch.int32, device=device)
+    blocks, begin = launcher.resident_blocks("pc_sample_cloud", _MOST_THREADS), 0
+    for cloud, count in enumerate(counts):
+        launcher.launch_blocks(
+            "pc_sample_cloud",
+            *(blocks, points, width, begin, ptr, cloud, count, nearest),
+            *(best[begin:], arrivals[cloud:], picks),
+            block=_MOST_THREADS,
+        )
+        begin += count
+    return picks
