@@ -10,6 +10,8 @@ from torch import Tensor
 from pcdata.functional.radius import cell_side, require_extent
 from pcdata.kernels.cuda.launching import Launcher
 
+MOST_ROWS = 2**29  # a table of four times as many places numbers them in 32 bits
+
 
 class CellTable(NamedTuple):
     """A hash table of cells, and the points in their order; C places."""
@@ -20,6 +22,8 @@ class CellTable(NamedTuple):
     ends: Tensor  # (C,) int32: where they end among the placed points
     placed: Tensor  # (N, 4) float32: x, y, z and the bits of the row
     place_of: Tensor  # (N,) int32: the place of each row's cell
+    listed: Tensor  # (N,) int32: the places of cells, in no fixed order; beyond their number nothing
+    num_listed: Tensor  # (1,) int32: their number
     far: Tensor  # (1,) int32: not 0 where a point lies so far out that its cell is not certain
 
     @property
@@ -35,17 +39,17 @@ def cell_table(launcher: Launcher, points: Tensor, ptr: Tensor, radius: float, n
     size = 1 << max(4, (2 * rows - 1).bit_length())
     places = torch.zeros(size, dtype=torch.int64, device=device)
     counts = torch.zeros(size, dtype=torch.int32, device=device)
-    far = torch.zeros(1, dtype=torch.int32, device=device)
-    place_of, rank_of = (torch.empty(rows, dtype=torch.int32, device=device) for _ in range(2))
+    num_listed, far = torch.zeros((2, 1), dtype=torch.int32, device=device).unbind()
+    place_of, rank_of, listed = torch.empty((3, rows), dtype=torch.int32, device=device).unbind()
     launcher.launch(
         "pc_insert_cells",
         *(rows, points, ptr, clouds, rows, side, places, size - 1),
-        *(needed, place_of, rank_of, counts, far),
+        *(needed, place_of, rank_of, counts, listed, num_listed, far),
     )
     ends = counts.cumsum(0, dtype=torch.int32)
     placed = torch.empty((rows, 4), dtype=torch.float32, device=device)
     launcher.launch("pc_place_points", rows, points, rows, needed, place_of, rank_of, counts, ends, placed)
-    return CellTable(side, places, counts, ends, placed, place_of, far)
+    return CellTable(side, places, counts, ends, placed, place_of, listed, num_listed, far)
 
 
 def hold_to_extent(where: str, points: Tensor, ptr: Tensor, radius: float, far: Tensor) -> None:

@@ -9,10 +9,9 @@ import pcdata.functional.outliers  # noqa: F401 - the operation must be register
 from pcdata.contracts.dispatch import OPERATIONS, kernel
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.radius import squared_radius
-from pcdata.kernels.cuda.cells import cell_table, hold_to_extent
+from pcdata.kernels.cuda.cells import MOST_ROWS, cell_table, hold_to_extent
 from pcdata.kernels.cuda.launching import launcher_of
 
-_MOST_ROWS = 2**29  # a table of four times as many places numbers them in 32 bits
 _REACH = 32  # rows looked at on either side
 
 
@@ -22,7 +21,7 @@ def radius_outlier_mask(
 ) -> Tensor:
     """Count beside each row, then, for those that are left, in the cells around them."""
     rows, clouds, device = len(points), len(ptr) - 1, points.device
-    if rows > _MOST_ROWS:
+    if rows > MOST_ROWS:
         fallen: Tensor = OPERATIONS["radius_outlier_mask"].reference(
             points, ptr, min_neighbors=min_neighbors, radius=radius
         )

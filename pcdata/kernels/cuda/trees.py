@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import torch
@@ -44,7 +45,7 @@ def box_tree(launcher: Launcher, points: Tensor, ptr: Tensor) -> BoxTree:
     least_rows = torch.empty(nodes, dtype=torch.int32, device=device)
     launcher.launch("pc_box_leaves", levels[0], placed, rows, levels[0], sides, least_rows, nodes)
     below = 0
-    for lower, level in zip(levels, levels[1:]):
+    for lower, level in pairwise(levels):
         first = below + lower
         launcher.launch("pc_box_parents", level, first, level, below, sides, least_rows, nodes)
         below = first

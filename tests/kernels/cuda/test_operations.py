@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
+from pcdata import functional as F
 from pcdata.contracts.dispatch import OPERATIONS
 from tests import pretend_device
 from tests.functional.test_op_contract import EXAMPLES, call, clouds_of, packed
@@ -66,4 +67,8 @@ def test_every_kernel_is_run_by_some_operation():
         launcher = harness.use(0)
         call(example, packed(example, clouds_of(example)), backend=harness.BACKEND)
         ran |= set(launcher.started)
+    launcher = harness.use(0)
+    F.knn(torch.rand(1100, 3), k=1, backend=harness.BACKEND)  # parents of leaves
+    F.farthest_point_sample(torch.rand(33_000, 3), num_samples=2, backend=harness.BACKEND)  # all blocks for one cloud
+    ran |= set(launcher.started)
     assert ran == set(harness.kernel_names())

@@ -20,7 +20,7 @@ def way(request, monkeypatch):
     if request.param == "all blocks":
         monkeypatch.setattr(sampling, "_LARGE", 0)
         monkeypatch.setattr(sampling, "_MOST_THREADS", 64)  # fewer fibers
-    yield "pc_sample_cloud" if request.param == "all blocks" else "pc_sample_clouds"
+    return "pc_sample_cloud" if request.param == "all blocks" else "pc_sample_clouds"
 
 
 def agree(points, ptr, **options) -> None:

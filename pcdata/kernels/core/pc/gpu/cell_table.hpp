@@ -48,13 +48,14 @@ struct Cells {
     return false;
   }
 
-  // The place of a row's cell, taken if the cell has none.
-  PC_HD int64_t insert(const Cell& cell, int64_t row) const {
+  // The place of a row's cell, taken if the cell has none; `is_new` says so.
+  PC_HD int64_t insert(const Cell& cell, int64_t row, bool& is_new) const {
     const uint64_t hash = cell.hash(), own = marked(hash, row);
     for (int64_t place = first(hash);; place = (place + 1) & mask) {
       uint64_t held = fresh(places + place);
       if (held == 0) held = atomic_swap_if(places + place, uint64_t{0}, own);
-      if (held == 0 || holds(held, own, cell)) return place;
+      is_new = held == 0;
+      if (is_new || holds(held, own, cell)) return place;
     }
   }
   // The place of a cell, -1 if it has none.
@@ -82,16 +83,19 @@ struct Cells {
 };
 
 // Put every row into its cell: its place in the table, and how many of that cell came before it; both are skipped if
-// `needed` (1,) is 0. Sets `far` (1,) if a point lies so far out that its cell is not certain.
+// `needed` (1,) is 0. The places of cells are listed, `num_listed` (1,) of them. Sets `far` (1,) if a point lies so far
+// out that its cell is not certain.
 PC_KERNEL(pc_insert_cells, const float* points, const int64_t* ptr, int64_t clouds, int64_t rows, double side,
           uint64_t* places, int64_t mask, const int32_t* needed, int32_t* place_of, int32_t* rank_of, int32_t* counts,
-          int32_t* far) {
+          int32_t* listed, int32_t* num_listed, int32_t* far) {
   const int64_t row = thread_index();
   if (row >= rows || *needed == 0) return;
   const Cells cells{points, ptr, clouds, side, places, mask};
   const int64_t cloud = cloud_of(ptr, clouds, row);
   if (cells.is_far(cloud, points + 3 * row)) *far = 1;
-  const int64_t place = cells.insert(cells.cell_of(cloud, points + 3 * row), row);
+  bool is_new = false;
+  const int64_t place = cells.insert(cells.cell_of(cloud, points + 3 * row), row, is_new);
+  if (is_new) listed[atomic_add(num_listed, 1)] = static_cast<int32_t>(place);
   place_of[row] = static_cast<int32_t>(place);
   rank_of[row] = atomic_add(counts + place, 1);
 }
