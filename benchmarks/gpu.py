@@ -4,15 +4,17 @@
     PYTHONPATH=. python benchmarks/gpu.py  # writes results/gpu.json
     PYTHONPATH=. python benchmarks/gpu.py --rehearse   # without a GPU, on the device of the tests; keeps nothing
 
-Parity: the examples of the contract suites and a fused volume. Masks, indices and labels are the same; other numbers
-differ by at most 2e-6. Timings: medians of wall time, synchronized before and after, on a warm device, for a synthetic
-1280x720 frame; ``waits`` counts the calls in which torch says that the host waited. One error stops nothing: it is a
-row, and the exit code is 1.
+Parity: the examples of the contract suites, by every backend that serves them, and a fused volume. Masks, indices and
+labels are the same; other numbers differ by at most 2e-6. Timings: medians of wall time, synchronized before and after,
+on a warm device, for a synthetic 1280x720 frame; ``waits`` counts the calls in which torch says that the host waited,
+``kernels`` those of pcdata that were started: none means that plain torch ran. One error stops nothing: it is a row,
+and the exit code is 1.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import statistics
 import sys
@@ -29,6 +31,8 @@ from torch import Tensor
 import pcdata
 from pcdata import functional as F
 from pcdata import transforms as T
+from pcdata.contracts import dispatch
+from pcdata.kernels.cuda import launching
 from pcdata.rng import seeded
 from pcdata.structures import TSDFVolume
 from pcdata.synthetic import tabletop
@@ -49,11 +53,15 @@ def main() -> int:
     parser.add_argument("--only", default="", help="rows whose name contains this; keep nothing")
     arguments = parser.parse_args()
     device = rehearsed() if arguments.rehearse else torch.device("cuda", torch.cuda.current_device())
-    result: dict[str, Any] = {"device": about(device), "parity": [], "timings": []}
+    backends = dispatch.AUTO_ORDER.get(device.type, dispatch.OTHER_DEVICES)
+    result: dict[str, Any] = {"device": about(device), "backends": {}, "parity": [], "timings": []}
+    for backend in backends:
+        result["backends"][backend] = dispatch.why_unavailable(backend) or "live"
+        print(f"backend {backend}: {result['backends'][backend]}", flush=True)
     for name, compare in parity_cases(device):
         if arguments.only in name:
             result["parity"].append(compared(name, compare))
-    for name, goal, call in timing_cases(device, (72, 128) if arguments.rehearse else (720, 1280)):
+    for name, goal, call in timing_cases(device, (36, 64) if arguments.rehearse else (720, 1280)):
         if arguments.only in name:
             result["timings"].append(timed(name, goal, call, device))
     bad = [row["name"] for row in result["parity"] if not row["same"]]
@@ -66,9 +74,13 @@ def main() -> int:
 
 
 def rehearsed() -> torch.device:
-    from tests.pretend_device import device
+    from tests import pretend_device
+    from tests.kernels.cuda import harness
 
-    return device()
+    if harness.unavailable() is None:
+        harness.register()
+        dispatch.AUTO_ORDER[pretend_device.NAME] = (harness.BACKEND, "torch_tree", "torch")
+    return pretend_device.device()
 
 
 def about(device: torch.device) -> dict[str, Any]:
@@ -82,17 +94,20 @@ def about(device: torch.device) -> dict[str, Any]:
 def parity_cases(device: torch.device) -> Iterator[tuple[str, Callable[[], list[str]]]]:
     """Yield names, and calls that return what differs."""
     for example in operations.EXAMPLES:
-        yield f"{example.name} ({example.cloud.__name__})", lambda e=example: operation_differences(e, device)
+        for backend in dispatch.AUTO_ORDER.get(device.type, dispatch.OTHER_DEVICES):
+            if dispatch.why_unavailable(backend) is None and dispatch.OPERATIONS[example.name].serves(backend):
+                name = f"{example.name} ({example.cloud.__name__}) by {backend}"
+                yield name, lambda e=example, b=backend: operation_differences(e, device, b)
     for name, examples in steps.EXAMPLES.items():
         for number, example in enumerate(examples):
             yield f"{name} ({number})", lambda e=example: step_differences(e, device)
     yield "TSDFVolume", lambda: volume_differences(device)
 
 
-def operation_differences(example: operations.Example, device: torch.device) -> list[str]:
+def operation_differences(example: operations.Example, device: torch.device, backend: str) -> list[str]:
     arguments = operations.packed(example, operations.clouds_of(example))
     expected = operations.call(example, arguments, backend="torch")
-    found = operations.call(example, {key: value.to(device) for key, value in arguments.items()})
+    found = operations.call(example, {key: value.to(device) for key, value in arguments.items()}, backend=backend)
     return [
         f"output {place}: {told}" for place, pair in enumerate(zip(found, expected)) if (told := apart(*pair, device))
     ]
@@ -184,18 +199,24 @@ def timing_cases(device: torch.device, size: tuple[int, int]) -> Iterator[tuple[
     above = points[~on_plane].contiguous()
     yield "DBSCAN 2 cm, 10", 1.0, lambda: F.dbscan(above, eps=0.02, min_points=10)
     yield "voxels 5 mm", 0.25, lambda: F.voxel_downsample(points, voxel_size=0.005)
-    few = points[torch.randperm(len(points), generator=seeded(0)).to(device)[: 3 * len(points) // 10]].contiguous()
+    some = points[torch.randperm(len(points), generator=seeded(0)).to(device)[: 3 * len(points) // 10]].contiguous()
     for wanted, goal in ((1024, 2.0), (4096, 8.0), (20_000, 40.0)):
-        if wanted < len(few):
+        if wanted < len(some):
             yield (
-                f"farthest points {len(few)} to {wanted}",
+                f"farthest points {len(some)} to {wanted}",
                 goal,
-                lambda w=wanted: F.farthest_point_sample(few, num_samples=w),
+                lambda w=wanted: F.farthest_point_sample(some, num_samples=w),
             )
-    many = points[:1].new_empty((128 * 3000, 3))
-    many.copy_(torch.rand(128 * 3000, 3, generator=seeded(0)))
-    ptr = (torch.arange(129, device="cpu") * 3000).to(device)
-    yield "farthest points 128 x 3000 to 128", 0.15, lambda: F.farthest_point_sample(many, ptr, num_samples=128)
+    each = 3000 if size[0] >= 100 else 30
+    many = points[:1].new_empty((128 * each, 3))
+    many.copy_(torch.rand(128 * each, 3, generator=seeded(0)))
+    ptr = (torch.arange(129, device="cpu") * each).to(device)
+    fewer = min(128, each)
+    yield (
+        f"farthest points 128 x {each} to {fewer}",
+        0.15,
+        lambda: F.farthest_point_sample(many, ptr, num_samples=fewer),
+    )
     yield "normals 2 cm, 30", 0.6, lambda: F.estimate_normals(points, radius=0.02, max_neighbors=30, grid=grid)
     yield "flying pixels", None, lambda: F.flying_pixel_mask(frame.depth)
     yield "16 nearest", None, lambda: F.knn(points, k=16)
@@ -208,7 +229,8 @@ def timing_cases(device: torch.device, size: tuple[int, int]) -> Iterator[tuple[
 
 def timed(name: str, goal: float | None, call: Callable[[], Any], device: torch.device) -> dict[str, Any]:
     try:
-        seconds = [run_once(call, device)]  # warms up
+        with kernels_started() as kernels:
+            seconds = [run_once(call, device)]  # warms up
         waits = waits_of(call, device)
         seconds = [run_once(call, device) for _ in range(1 if seconds[0] > SLOW else REPEATS)]
     except Exception as error:  # a row, as above
@@ -221,9 +243,35 @@ def timed(name: str, goal: float | None, call: Callable[[], Any], device: torch.
         "iqr_ms": 1e3 * (high - low),
         "goal_ms": goal,
         "waits": waits,
+        "kernels": len(kernels),
     }
-    print(f"{name}: {row['ms']:.3f} ms ({row['iqr_ms']:.3f}), goal {goal}, {waits} waits", flush=True)
+    print(
+        f"{name}: {row['ms']:.3f} ms ({row['iqr_ms']:.3f}), goal {goal}, {waits} waits, {len(kernels)} kernels",
+        flush=True,
+    )
     return row
+
+
+@contextlib.contextmanager
+def kernels_started() -> Iterator[list[str]]:
+    """Give the names of pcdata's kernels that are started meanwhile."""
+    names: list[str] = []
+    ways = {name: getattr(launching.Launcher, name) for name in ("launch", "launch_blocks")}
+
+    def noting(way: Callable[..., None]) -> Callable[..., None]:
+        def start(self: launching.Launcher, name: str, *arguments: Any, **options: Any) -> None:
+            names.append(name)
+            way(self, name, *arguments, **options)
+
+        return start
+
+    try:
+        for name, way in ways.items():
+            setattr(launching.Launcher, name, noting(way))
+        yield names
+    finally:
+        for name, way in ways.items():
+            setattr(launching.Launcher, name, way)
 
 
 def run_once(call: Callable[[], Any], device: torch.device) -> float:

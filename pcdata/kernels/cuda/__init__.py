@@ -6,6 +6,7 @@ from pcdata.kernels.cuda import clusters as cuda_clusters
 from pcdata.kernels.cuda import neighbors as cuda_neighbors
 from pcdata.kernels.cuda import outliers as cuda_outliers
 from pcdata.kernels.cuda import sampling as cuda_sampling
+from pcdata.kernels.cuda import voxels as cuda_voxels
 from pcdata.kernels.cuda.gpu import unavailable
 
-__all__ = ["cuda_clusters", "cuda_neighbors", "cuda_outliers", "cuda_sampling", "unavailable"]
+__all__ = ["cuda_clusters", "cuda_neighbors", "cuda_outliers", "cuda_sampling", "cuda_voxels", "unavailable"]

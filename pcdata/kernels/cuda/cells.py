@@ -36,7 +36,7 @@ def cell_table(launcher: Launcher, points: Tensor, ptr: Tensor, radius: float, n
     """Sort points into cells for a radius; all kernels do nothing where ``needed`` (1,) int32 is 0."""
     rows, clouds, device = len(points), len(ptr) - 1, points.device
     side = cell_side(radius)
-    size = 1 << max(4, (2 * rows - 1).bit_length())
+    size = num_places(rows)
     places = torch.zeros(size, dtype=torch.int64, device=device)
     counts = torch.zeros(size, dtype=torch.int32, device=device)
     num_listed, far = torch.zeros((2, 1), dtype=torch.int32, device=device).unbind()
@@ -50,6 +50,11 @@ def cell_table(launcher: Launcher, points: Tensor, ptr: Tensor, radius: float, n
     placed = torch.empty((rows, 4), dtype=torch.float32, device=device)
     launcher.launch("pc_place_points", rows, points, rows, needed, place_of, rank_of, counts, ends, placed)
     return CellTable(side, places, counts, ends, placed, place_of, listed, num_listed, far)
+
+
+def num_places(rows: int) -> int:
+    """Return how many places a table has for cells of so many rows: at most half of them are taken."""
+    return 1 << max(4, (2 * rows - 1).bit_length())
 
 
 def hold_to_extent(where: str, points: Tensor, ptr: Tensor, radius: float, far: Tensor) -> None:

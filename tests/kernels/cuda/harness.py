@@ -24,10 +24,13 @@ from pcdata.contracts import dispatch
 from pcdata.kernels.cuda import launching
 from pcdata.kernels.cuda.declarations import SOURCES, kernels, sources_digest
 from tests import pretend_device
+from tests.sanitized import UNDER_SANITIZERS
 
 BACKEND = "cuda_harness"
 COMPILER = shutil.which("g++")
 FLAGS = ["-std=c++17", "-O1", "-shared", "-fPIC", "-ffp-contract=off", "-fvisibility=hidden", "-Wall", "-Wextra"]
+if UNDER_SANITIZERS:
+    FLAGS += ["-fsanitize=address,undefined", "-fno-sanitize-recover=all", "-g1"]
 
 
 def unavailable() -> str | None:

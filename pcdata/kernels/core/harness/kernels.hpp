@@ -7,3 +7,4 @@
 #include "pc/gpu/farthest.hpp"
 #include "pc/gpu/nearest.hpp"
 #include "pc/gpu/radius.hpp"
+#include "pc/gpu/voxels.hpp"

@@ -38,7 +38,7 @@ PC_KERNEL(pc_mark_cores, const float* points, const int64_t* ptr, int64_t clouds
           int64_t wanted, const int32_t* place_of, uint8_t* core, int32_t* core_counts, int32_t* parents) {
   const int64_t i = thread_index();
   if (i >= rows) return;
-  const Cells cells{points, ptr, clouds, side, places, mask};
+  const Cells cells{{points, ptr, clouds, side}, places, mask};
   const Placed* sorted = reinterpret_cast<const Placed*>(placed);
   const int64_t row = sorted[i].row;  // neighboring threads look at the same cells
   const int32_t place = place_of[row];
@@ -73,12 +73,12 @@ PC_BLOCK_KERNEL(pc_join_cells, const float* points, const int64_t* ptr, int64_t 
                 int64_t mask, const int32_t* counts, const int32_t* ends, const float* placed, double limit,
                 const int32_t* listed, const int32_t* num_listed, const uint8_t* core, const int32_t* core_counts,
                 int32_t* parents) {
-  const Cells cells{points, ptr, clouds, side, places, mask};
+  const Cells cells{{points, ptr, clouds, side}, places, mask};
   const Placed* sorted = reinterpret_cast<const Placed*>(placed);
   for (int64_t i = thread_index() / PC_WARP; i < *num_listed; i += thread_count() / PC_WARP) {
     const int32_t place = listed[i];
     if (core_counts[place] == 0) continue;
-    const Cell home = cells.cell_of(sorted[ends[place] - 1].row);
+    const Cell home = cells.grid.cell_of(sorted[ends[place] - 1].row);
     for (int shell = 1; shell <= kCellReach; ++shell)
       for (int dx = 0; dx <= shell; ++dx)
         for (int dy = dx > 0 ? -shell : 0; dy <= shell; ++dy)
@@ -124,7 +124,7 @@ PC_KERNEL(pc_label_rows, const float* points, const int64_t* ptr, int64_t clouds
           const int32_t* lowest, const int64_t* begun, int64_t* label) {
   const int64_t at = thread_index();
   if (at >= rows) return;
-  const Cells cells{points, ptr, clouds, side, places, mask};
+  const Cells cells{{points, ptr, clouds, side}, places, mask};
   const Placed* sorted = reinterpret_cast<const Placed*>(placed);
   const int64_t row = sorted[at].row, begin = ptr[cloud_of(ptr, clouds, row)];
   if (core[row]) {
@@ -133,7 +133,7 @@ PC_KERNEL(pc_label_rows, const float* points, const int64_t* ptr, int64_t clouds
   }
   const float below = static_cast<float>(limit);
   const float* point = points + 3 * row;
-  const Cell home = cells.cell_of(row);
+  const Cell home = cells.grid.cell_of(row);
   int64_t least = -1;
   for (int dx = -kCellReach; dx <= kCellReach; ++dx)
     for (int dy = -kCellReach; dy <= kCellReach; ++dy)

@@ -42,11 +42,11 @@ constexpr int kCellReach = 2;  // ceil(sqrt(3)), and a margin
 // The neighbors of a row, up to one more than enough, in the cells around its own: those that touch it first.
 PC_HD int64_t count_in_cells(const Cells& cells, const int32_t* counts, const int32_t* ends, const Placed* placed,
                              int64_t row, float below, int64_t enough) {
-  const float* point = cells.points + 3 * row;
-  const Cell home = cells.cell_of(row);
-  const double fraction[3] = {cells.coordinate(home.cloud, point, 0) - static_cast<double>(home.at.x),
-                              cells.coordinate(home.cloud, point, 1) - static_cast<double>(home.at.y),
-                              cells.coordinate(home.cloud, point, 2) - static_cast<double>(home.at.z)};
+  const float* point = cells.grid.points + 3 * row;
+  const Cell home = cells.grid.cell_of(row);
+  const double fraction[3] = {cells.grid.coordinate(home.cloud, point, 0) - static_cast<double>(home.at.x),
+                              cells.grid.coordinate(home.cloud, point, 1) - static_cast<double>(home.at.y),
+                              cells.grid.coordinate(home.cloud, point, 2) - static_cast<double>(home.at.z)};
   int64_t found = 0;
   for (int shell = 0; shell <= kCellReach && found <= enough; ++shell)
     for (int dx = -shell; dx <= shell && found <= enough; ++dx)
@@ -67,7 +67,7 @@ PC_HD int64_t count_in_cells(const Cells& cells, const int32_t* counts, const in
 PC_KERNEL(pc_count_around, const float* points, const int64_t* ptr, int64_t clouds, double side, uint64_t* places,
           int64_t mask, const int32_t* counts, const int32_t* ends, const float* placed, double limit, int64_t enough,
           const int32_t* undecided, const int32_t* count, const int32_t* place_of, uint8_t* outlier) {
-  const Cells cells{points, ptr, clouds, side, places, mask};
+  const Cells cells{{points, ptr, clouds, side}, places, mask};
   for (int64_t i = thread_index(); i < *count; i += thread_count()) {
     const int64_t row = undecided[i];
     if (counts[place_of[row]] > enough || count_in_cells(cells, counts, ends, reinterpret_cast<const Placed*>(placed),
