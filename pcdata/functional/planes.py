@@ -167,7 +167,7 @@ def refine_planes(
     rows, own, own_ptr, before = None, points, ptr, inliers
     for _ in range(MAX_REFINEMENTS):
         refitted = fit_planes(own, own_ptr, before, backend=REFERENCE)
-        fits = ~refitted[:, 0].isnan() & _within_tilt(refitted, None if ups is None else ups[unsettled], max_tilt)
+        fits = ~refitted[:, 0].isnan() & within_tilt(refitted, None if ups is None else ups[unsettled], max_tilt)
         after = near_planes(own, own_ptr, refitted, distance, backend=REFERENCE)
         fits &= count_per_cloud(after, own_ptr).cpu() >= 3
         settled = fits & (count_per_cloud(differing(after, before), own_ptr).cpu() == 0)
@@ -267,7 +267,7 @@ def ransac_plane(
         if guess is not None:
             hypotheses = torch.cat([guess[some, None], hypotheses], 1)
         is_plane = ~hypotheses[..., 0].isnan()
-        competes = is_plane & _within_tilt(hypotheses, None if up is None else up[some, None], max_tilt)
+        competes = is_plane & within_tilt(hypotheses, None if up is None else up[some, None], max_tilt)
         runs = bound_runs(own, own_ptr, backend=backend)
         near = _count_until_probable(
             own,
@@ -399,7 +399,7 @@ def _face(planes: Tensor, ups: Tensor | None, distance: float) -> Tensor:
     return torch.where((sign < 0)[:, None], -planes, planes)
 
 
-def _within_tilt(planes: Tensor, ups: Tensor | None, max_tilt: float | None) -> Tensor:
+def within_tilt(planes: Tensor, ups: Tensor | None, max_tilt: float | None) -> Tensor:
     """Say which (..., 4) planes may compete."""
     if ups is None or max_tilt is None:
         return torch.ones(planes.shape[:-1], dtype=torch.bool, device="cpu")

@@ -5,8 +5,17 @@ from __future__ import annotations
 from pcdata.kernels.cuda import clusters as cuda_clusters
 from pcdata.kernels.cuda import neighbors as cuda_neighbors
 from pcdata.kernels.cuda import outliers as cuda_outliers
+from pcdata.kernels.cuda import planes as cuda_planes
 from pcdata.kernels.cuda import sampling as cuda_sampling
 from pcdata.kernels.cuda import voxels as cuda_voxels
 from pcdata.kernels.cuda.gpu import unavailable
 
-__all__ = ["cuda_clusters", "cuda_neighbors", "cuda_outliers", "cuda_sampling", "cuda_voxels", "unavailable"]
+__all__ = [
+    "cuda_clusters",
+    "cuda_neighbors",
+    "cuda_outliers",
+    "cuda_planes",
+    "cuda_sampling",
+    "cuda_voxels",
+    "unavailable",
+]

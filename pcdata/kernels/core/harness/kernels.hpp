@@ -6,5 +6,6 @@
 #include "pc/gpu/clusters.hpp"
 #include "pc/gpu/farthest.hpp"
 #include "pc/gpu/nearest.hpp"
+#include "pc/gpu/planes.hpp"
 #include "pc/gpu/radius.hpp"
 #include "pc/gpu/voxels.hpp"
