@@ -24,6 +24,7 @@ from pcdata.transforms.decisions import Decision, Decisions, Entry, in_a_row
 from pcdata.transforms.field_checks import validated_fields
 from pcdata.transforms.fused_beginning import find_beginning, run_beginning
 from pcdata.transforms.fused_motions import motions_from, read_by_motions, run_motions
+from pcdata.transforms.fused_selections import SetAside, are_many, looked_at, run_selections, selections_from
 from pcdata.yaml_nodes import Document, YamlDocument, yaml_text
 
 
@@ -112,7 +113,8 @@ class Compose(Transform):
     ) -> Any:
         """Run every step as :meth:`forward` does; call ``after(positions of the steps, data)`` behind each pass.
 
-        Several steps may be one pass, so what lies between them is never made: :meth:`step_through` makes it.
+        Several steps may be one pass, so what lies between them is never made, and between selections fields that none
+        of them looks at are missing: :meth:`step_through` makes all.
         """
         return self._run(data, generator, after=after)
 
@@ -127,20 +129,14 @@ class Compose(Transform):
         after: Callable[[range, Any], None] | None = None,
     ) -> Any:
         position, generator = self._enter(data, generator)
-        steps = list(self.steps)
-        beginning = self._beginning
-        if beginning is not None and position <= beginning.start:
-            for number in range(position, beginning.start):
-                data, generator = _step(steps[number], data, generator)
-                if after is not None:
-                    after(range(number, number + 1), data)
-            cloud = run_beginning(steps[beginning], data)
-            position = beginning.start
-            if cloud is not None:
-                data, position = cloud, beginning.stop
-                if after is not None:
-                    after(range(beginning.start, position), data)
+        steps, told = list(self.steps), after or _nobody
+        singly = 0  # up to this step, selections are not run together: one of them refuses
         while position < len(steps):
+            if self._beginning is not None and position == self._beginning.start:
+                begun = _begun(steps, self._beginning, data, told)
+                if begun is not None:
+                    data, position, singly = begun
+                    continue
             together = motions_from(steps, position)
             if together > 1 - is_own and isinstance(data, PointCloud):
                 assert generator is not None
@@ -150,18 +146,22 @@ class Compose(Transform):
                 if cloud is not None:
                     forget()  # the memory may be that of the clouds before
                     data, position, sources = cloud, position + together, None
-                    if after is not None:
-                        after(range(position - together, position), data)
+                    told(range(position - together, position), data)
                     continue
             if sources and isinstance(data, PointCloud):
                 gather_kept({name: getattr(data, name) for name in sources}, sources, data.ptr)
             sources = None
             # What a step gives may share its memory with what it got, or with its params.
             is_own = False
+            if position >= singly and isinstance(data, PointCloud) and are_many(data.num_points):
+                singly = position + selections_from(steps, position)
+                cloud = _selected(steps, range(position, singly), data, told)
+                if cloud is not None:
+                    data, position = cloud, singly
+                    continue
             data, generator = _step(steps[position], data, generator)
             position += 1
-            if after is not None:
-                after(range(position - 1, position), data)
+            told(range(position - 1, position), data)
         return data
 
     @property
@@ -315,6 +315,38 @@ class Compose(Transform):
 
     def __repr__(self) -> str:
         return f"Compose([{', '.join(map(repr, self.steps))}])"
+
+
+Told = Callable[[range, Any], None]  # positions of steps that have run, what they gave
+
+
+def _nobody(positions: range, data: Any) -> None:
+    """Hear it."""
+
+
+def _begun(steps: Sequence[Transform], beginning: slice, data: Data, told: Told) -> tuple[PointCloud, int, int] | None:
+    """Run the beginning and the selections behind it; return the cloud, the next step, and the first to be joined.
+
+    None where the steps must be run one by one.
+    """
+    stop = beginning.stop + selections_from(steps, beginning.stop)
+    done = run_beginning(steps[beginning], data, behind=steps[beginning.stop : stop])
+    if done is None:
+        return None
+    cloud, aside = done
+    told(range(beginning.start, beginning.stop), cloud)
+    if aside is None:
+        return cloud, beginning.stop, beginning.stop
+    left = run_selections(steps, range(beginning.stop, stop), cloud, aside, told)
+    return (aside.back(cloud), beginning.stop, stop) if left is None else (left, stop, stop)
+
+
+def _selected(steps: Sequence[Transform], positions: range, cloud: PointCloud, told: Told) -> PointCloud | None:
+    """Run selections together; None where there are not two, or they must be run one by one."""
+    if len(positions) < 2:
+        return None
+    parts = SetAside.of_cloud(cloud, looked_at(steps[positions.start : positions.stop]))
+    return None if parts is None else run_selections(steps, positions, parts[1], parts[0], told)
 
 
 def _step(step: Transform, data: Data, generator: GeneratorLike | None) -> tuple[Data, GeneratorLike | None]:

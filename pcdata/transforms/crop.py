@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Literal
 
 import torch
@@ -16,7 +17,7 @@ from pcdata.structures import PointCloud
 from pcdata.structures.signal_kinds import poses_of_signal
 from pcdata.transforms.base import Params
 from pcdata.transforms.decisions import Decisions
-from pcdata.transforms.families import RemoveTransform
+from pcdata.transforms.families import GEOMETRY, RemoveTransform
 from pcdata.transforms.field_types import Matrix4, Name, Vec3
 
 
@@ -64,6 +65,10 @@ class CropWorkspace(RemoveTransform):
     def is_plain(self) -> bool:
         """Whether it keeps one box that is aligned with the frame."""
         return self.frame_from_box is None and not self.invert and not isinstance(self.lower, str)
+
+    def looks_at(self) -> Collection[str]:
+        """The points."""
+        return GEOMETRY
 
     def frame_needed(self) -> str:
         """The frame of the box."""
@@ -174,6 +179,10 @@ class CropPolygon(RemoveTransform):
             raise ConfigError(f"CropPolygon: polygon must have three corners or more, got {self.polygon}")
         if self.low is not None and self.high is not None and self.low >= self.high:
             raise ConfigError(f"CropPolygon: low must be below high, got {self.low}, {self.high}")
+
+    def looks_at(self) -> Collection[str]:
+        """The points."""
+        return GEOMETRY
 
     def frame_needed(self) -> str:
         """The frame of the prism."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated, Any
 
 import torch
@@ -103,6 +103,10 @@ class Deproject(Transform):
         images = {"labels": data.labels, "confidence": data.confidence}
         return {name: image for name, image in images.items() if image is not None}
 
+    def kinds_of(self, images: Collection[str]) -> dict[str, Kind]:
+        """Return the kinds of the extra fields that images become."""
+        return {name: Kind.MINIMUM for name in images if name != "labels"}
+
     def cloud_of(self, data: DepthFrame, own: Deprojected) -> PointCloud:
         """Return the points with all that the capture, which is checked, knows about them."""
         intrinsics, distortion = self.cameras_of(data)
@@ -123,7 +127,7 @@ class Deproject(Transform):
             labels=own.rows.get("labels"),
             source_index=own.source_index,
             extra=extra,
-            kinds=dict.fromkeys(extra, Kind.MINIMUM),
+            kinds=self.kinds_of(extra),
             layout=None if distortion is not None else ImageLayout(size=data.size, intrinsics=intrinsics),
             viewpoint=torch.zeros(data.num_views, 3, dtype=torch.float32, device=data.device),
             source_from_cloud=identity.clone(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
 from typing import Annotated, Any
 
 import torch
@@ -18,7 +19,7 @@ from pcdata.sensors import SensorProfile
 from pcdata.structures import METRE, PointCloud
 from pcdata.structures.kinds import fillers
 from pcdata.transforms.base import Params, Transform, sample_name
-from pcdata.transforms.families import SelectTransform
+from pcdata.transforms.families import GEOMETRY, SelectTransform
 from pcdata.transforms.field_types import (
     Count,
     Fraction,
@@ -172,6 +173,12 @@ class _FarthestPoints(_Sample, abstract=True):
 
     color_weight: NonNegative = 0.0
     balance_labels: bool = False
+
+    def looks_at(self) -> Collection[str] | None:
+        """The points, and colors and labels where they count; zero rows are zero in every field."""
+        if self.if_short == "zeros":
+            return None
+        return (*GEOMETRY, *["colors"] * bool(self.color_weight), *["labels"] * self.balance_labels)
 
     def starts(self, cloud: PointCloud, seeds: list[int]) -> dict[str, Any]:
         """Where each cloud begins, as farthest_point_sample takes it."""

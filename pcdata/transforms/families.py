@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +17,8 @@ from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms.base import Params, Transform, sample_name
 from pcdata.transforms.decisions import Decisions
 from pcdata.transforms.field_types import Fraction
+
+GEOMETRY = ("points", "source_index", "viewpoint")  # where points lie, on which pixels, and what saw them
 
 
 class LeftOutWarning(PcdataWarning):
@@ -40,6 +42,10 @@ class SpatialTransform(Transform, abstract=True):
 
 class SelectTransform(Transform, abstract=True):
     """A step that keeps some rows, possibly repeated or reordered within their cloud: write ``pick``."""
+
+    def looks_at(self) -> Collection[str] | None:
+        """The per-point fields that picking looks at, ``source_index`` for the image; None = it may look at any."""
+        return None
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Return ``index`` (M,) int64, or a (N,) bool mask, of the rows to keep, and the result's ``ptr`` (B+1,)."""

@@ -7,9 +7,10 @@ are those of the single steps, bit for bit; and whatever they would refuse is le
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import torch
+from torch import Tensor
 
 from pcdata.contracts.known import FINITE, note
 from pcdata.errors import PcdataError
@@ -21,6 +22,7 @@ from pcdata.transforms.base import Data, Params, Transform
 from pcdata.transforms.crop import CropWorkspace
 from pcdata.transforms.deproject import Deproject, MaskDepth
 from pcdata.transforms.frames import ToFrame
+from pcdata.transforms.fused_selections import SetAside, are_many, looked_at
 
 
 def find_beginning(steps: Sequence[Transform]) -> slice | None:
@@ -43,20 +45,27 @@ def find_beginning(steps: Sequence[Transform]) -> slice | None:
     return slice(start, stop + 1)
 
 
-def run_beginning(steps: Sequence[Transform], frame: Data) -> PointCloud | None:
-    """Run the steps that :func:`find_beginning` found; None where they must be run one by one."""
+def run_beginning(
+    steps: Sequence[Transform], frame: Data, *, behind: Sequence[Transform] = ()
+) -> tuple[PointCloud, SetAside | None] | None:
+    """Run the steps that :func:`find_beginning` found; None where they must be run one by one.
+
+    ``behind`` them selections may follow: what none of these looks at is left out of the cloud, and told beside it.
+    """
     if not isinstance(frame, DepthFrame):
         return None
     for step in steps:
         if step._forward_hooks or step._forward_pre_hooks:  # somebody watches it
             return None
     try:
-        return _run(steps, frame)
+        return _run(steps, frame, looked_at(behind) if behind else None)
     except PcdataError:
         return None  # the step that refuses says why
 
 
-def _run(steps: Sequence[Transform], frame: DepthFrame) -> PointCloud | None:
+def _run(
+    steps: Sequence[Transform], frame: DepthFrame, needed: Collection[str] | None
+) -> tuple[PointCloud, SetAside | None] | None:
     by_type = {type(step): step for step in steps}
     mask, deproject, move, crop = map(by_type.get, (MaskDepth, Deproject, ToFrame, CropWorkspace))
     assert isinstance(deproject, Deproject)
@@ -67,9 +76,15 @@ def _run(steps: Sequence[Transform], frame: DepthFrame) -> PointCloud | None:
     if isinstance(mask, MaskDepth):
         near, far, region = mask.near, mask.far, mask.mask_of(frame)
         frame = mask.recorded(frame, frame, {})
-    images = deproject.images_of(frame)
+    images, colors = deproject.images_of(frame), frame.colors
+    aside = None
+    if needed is not None and are_many(frame.depth.numel()):
+        left_out = {name: image for name, image in images.items() if name not in needed}
+        aside = SetAside.of_images(left_out, None if "colors" in needed else colors, deproject.kinds_of(images))
+        images = {name: image for name, image in images.items() if name in needed}
+        colors = colors if "colors" in needed else None
     # Without rows, the steps do all that they do but for the rows.
-    bare = deproject.cloud_of(frame, _nothing(frame, images))
+    bare = deproject.cloud_of(frame, _nothing(frame, colors, images))
     moved, moves = bare, Params()
     if isinstance(move, ToFrame):
         move.check_input(bare)
@@ -80,7 +95,7 @@ def _run(steps: Sequence[Transform], frame: DepthFrame) -> PointCloud | None:
     done = deproject_into_box(
         frame.depth,
         *deproject.cameras_of(frame),
-        frame.colors,
+        colors,
         images,
         matrix=None if matrix is None else matrix.to(frame.device),
         lower=crop.lower,
@@ -108,16 +123,16 @@ def _run(steps: Sequence[Transform], frame: DepthFrame) -> PointCloud | None:
     cloud = deproject.recorded_counts(cloud, None, before, {}, place=(bare.frame_id, bare.unit))
     if isinstance(move, ToFrame):
         cloud = move.recorded_counts(cloud, before, before, moves)
-    return crop.recorded_counts(cloud, before, after, {})
+    return crop.recorded_counts(cloud, before, after, {}), aside
 
 
-def _nothing(frame: DepthFrame, images: dict[str, torch.Tensor]) -> Deprojected:
+def _nothing(frame: DepthFrame, colors: Tensor | None, images: dict[str, Tensor]) -> Deprojected:
     """Return what no reading at all gives."""
     depth, views = frame.depth, frame.num_views
     return Deprojected(
         points=depth.new_empty((0, 3)),
         ptr=torch.zeros(views + 1, dtype=torch.int64, device=depth.device),
         source_index=torch.empty(0, dtype=torch.int64, device=depth.device),
-        colors=None if frame.colors is None else depth.new_empty((0, 3)),
+        colors=None if colors is None else depth.new_empty((0, 3)),
         rows={name: image.new_empty((0, *image.shape[3:])) for name, image in images.items()},
     )

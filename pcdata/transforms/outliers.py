@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Annotated
 
 from torch import Tensor
@@ -12,7 +13,7 @@ from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.sensors import SensorProfile
 from pcdata.structures import PointCloud
-from pcdata.transforms.families import RemoveTransform
+from pcdata.transforms.families import GEOMETRY, RemoveTransform
 from pcdata.transforms.field_types import Count, FromSensor, Metres, Positive
 
 
@@ -28,6 +29,10 @@ class RemoveStatisticalOutliers(RemoveTransform):
 
     num_neighbors: Count = 20
     std_ratio: Positive = 2.0
+
+    def looks_at(self) -> Collection[str]:
+        """The points and the image."""
+        return GEOMETRY
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Pick the usual rows."""
@@ -45,6 +50,10 @@ class RemoveRadiusOutliers(RemoveTransform):
 
     min_neighbors: Count = 5
     radius: Annotated[Metres, FromSensor(SensorProfile.outlier_radius)] = 0.01
+
+    def looks_at(self) -> Collection[str]:
+        """The points and the image."""
+        return GEOMETRY
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Pick the rows with company."""

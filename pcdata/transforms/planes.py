@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
+from collections.abc import Collection
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -27,7 +28,7 @@ from pcdata.structures import CAMERA_FRAME, METRE, PointCloud
 from pcdata.threads import torch_on_one_thread
 from pcdata.transforms.base import Params, sample_name
 from pcdata.transforms.decisions import Decisions
-from pcdata.transforms.families import RemoveTransform
+from pcdata.transforms.families import GEOMETRY, RemoveTransform
 from pcdata.transforms.field_types import Count, Metres, Name, Vec3
 from pcdata.transforms.found_planes import guessed_planes, plane_facts, plane_guesses
 
@@ -117,6 +118,10 @@ class RemovePlane(RemoveTransform):
             raise ConfigError("RemovePlane: max_tilt is measured from up; give up and frame too")
         if self.keep == "over" or self.cut == "measured":
             self.decides_by = "rows"  # type: ignore[misc, assignment]
+
+    def looks_at(self) -> Collection[str]:
+        """The points, the image, and where the sensor stood."""
+        return GEOMETRY
 
     def frame_needed(self) -> str | None:
         """The frame of ``up``."""

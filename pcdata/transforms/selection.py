@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import torch
 from torch import Tensor
 
@@ -10,12 +12,16 @@ from pcdata.functional.rows import ptr_after_mask
 from pcdata.functional.selection import duplicate_mask
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
-from pcdata.transforms.families import RemoveTransform
+from pcdata.transforms.families import GEOMETRY, RemoveTransform
 from pcdata.transforms.field_types import Name
 
 
 class RemoveDuplicates(RemoveTransform):
     """Drop points that repeat an earlier one of their cloud, coordinate for coordinate; the first one stays."""
+
+    def looks_at(self) -> Collection[str]:
+        """The points."""
+        return GEOMETRY
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Pick the first of equal points."""
@@ -38,6 +44,10 @@ class DropNonFinite(RemoveTransform):
         """Require a field."""
         if not self.fields:
             raise ConfigError("DropNonFinite: fields must name one, such as points")
+
+    def looks_at(self) -> Collection[str]:
+        """The fields."""
+        return (*GEOMETRY, *self.fields)
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Pick the rows that are numbers in every field."""
@@ -78,6 +88,10 @@ class KeepValues(RemoveTransform):
             raise ConfigError("KeepValues: give either values, or low, high or both")
         if self.low is not None and self.high is not None and self.low > self.high:
             raise ConfigError(f"KeepValues: low {self.low} exceeds high {self.high}")
+
+    def looks_at(self) -> Collection[str]:
+        """The field."""
+        return (*GEOMETRY, self.field)
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Pick by the field's values."""

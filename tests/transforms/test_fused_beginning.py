@@ -74,9 +74,10 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[PointCloud | None]:
     """What the runs in one pass gave, None where the steps had to run."""
     given: list[PointCloud | None] = []
 
-    def noted(*args: Any) -> PointCloud | None:
-        given.append(fused.run_beginning(*args))
-        return given[-1]
+    def noted(*args: Any, **options: Any) -> Any:
+        done = fused.run_beginning(*args, **options)
+        given.append(None if done is None else done[0])
+        return done
 
     monkeypatch.setattr("pcdata.transforms.compose.run_beginning", noted)
     return given

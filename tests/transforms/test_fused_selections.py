@@ -1,0 +1,280 @@
+"""Selections run together give exactly what they give one after another, on captures and on clouds."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from pcdata.contracts.dispatch import why_unavailable
+from pcdata.errors import ConfigError
+from pcdata.functional.rows import ptr_after_mask
+from pcdata.rng import Streams
+from pcdata.structures import DepthFrame, Kind, PointCloud
+from pcdata.synthetic import tabletop
+from pcdata.transforms import (
+    Compose,
+    CropPolygon,
+    CropWorkspace,
+    Deproject,
+    DropNonFinite,
+    EstimateNormals,
+    FarthestPointSample,
+    KeepValues,
+    MaskDepth,
+    MergeViews,
+    RandomPointDropout,
+    RemoveDuplicates,
+    RemovePlane,
+    RemoveRadiusOutliers,
+    RemoveStatisticalOutliers,
+    SelectTransform,
+    ToFrame,
+)
+from pcdata.transforms import fused_selections as fused
+from pcdata.transforms.base import REGISTRY
+from tests.factories import assert_same
+from tests.transforms.examples import ALL, NAMES
+
+SCENE = tabletop(2, num_objects=3, num_views=2, size=(36, 48)).frame
+FULL = dataclasses.replace(
+    SCENE,
+    confidence=(torch.arange(2 * 36 * 48).reshape(2, 36, 48) % 3 + 1).to(torch.uint8),
+    sample_id="scene",
+    provenance={"history": [{"step": "Earlier"}]},
+)
+CROP = CropWorkspace(frame="camera", lower=(-0.3, -0.2, 0.2), upper=(0.25, 0.3, 1.5))
+SQUARE = ((-0.2, -0.2), (0.2, -0.2), (0.2, 0.2), (-0.2, 0.2))
+USUAL = [
+    RemoveStatisticalOutliers(num_neighbors=8),
+    RemoveRadiusOutliers(min_neighbors=2, radius=0.05),
+    RemovePlane(num_hypotheses=50),
+]
+CHAINS: dict[str, list[Any]] = {
+    "usual": [MaskDepth(far=2.0), Deproject(), CROP, *USUAL, FarthestPointSample(num_points=64)],
+    "nothing behind": [Deproject(), CROP, *USUAL],
+    "more behind": [Deproject(), CROP, *USUAL, EstimateNormals(radius=0.1), RemoveRadiusOutliers(radius=0.1)],
+    "in the base": [
+        Deproject(),
+        ToFrame(frame="base"),
+        CropWorkspace(frame="base", lower=(-0.3, -0.3, -0.1), upper=(0.3, 0.3, 0.5)),
+        CropPolygon(frame="base", polygon=SQUARE),
+        RemoveDuplicates(),
+    ],
+    "merged": [
+        Deproject(),
+        ToFrame(frame="base"),
+        MergeViews(),
+        CropWorkspace(frame="base", lower=(-0.3, -0.3, -0.1), upper=(0.3, 0.3, 0.5)),
+        RemovePlane(num_hypotheses=50, keep="above", cut="measured", up=(0, 0, 1), frame="base"),
+        RemoveRadiusOutliers(min_neighbors=2, radius=0.05),
+    ],
+    "by labels": [Deproject(), CROP, KeepValues(values=(0, 1, 2)), RemoveRadiusOutliers(min_neighbors=2, radius=0.05)],
+    "by confidence": [Deproject(), CROP, KeepValues(field="confidence", low=2), DropNonFinite(fields=("confidence",))],
+    "by color": [Deproject(), CROP, FarthestPointSample(num_points=32, color_weight=0.3)],
+    "balanced": [Deproject(), CROP, FarthestPointSample(num_points=32, balance_labels=True)],
+    "short": [Deproject(), CROP, FarthestPointSample(num_points=20_000, if_short="tile")],
+    "zeros": [Deproject(), CROP, RemoveDuplicates(), FarthestPointSample(num_points=20_000, if_short="zeros")],
+    "random within": [Deproject(), CROP, *USUAL[:2], RandomPointDropout(), *USUAL[:2]],
+}
+
+SELECTIONS = {
+    name: example
+    for name, example in zip(NAMES, ALL)
+    if isinstance(example.transform, SelectTransform) and example.transform.looks_at() is not None
+}
+
+
+def frames() -> dict[str, DepthFrame]:
+    return {
+        "full": FULL,
+        "without colors": dataclasses.replace(FULL, colors=None),
+        "without anything": dataclasses.replace(SCENE, colors=None, labels=None),
+        "one view": FULL.view(1),
+    }
+
+
+def fits(chain: str, frame: DepthFrame) -> bool:
+    return not (
+        (chain == "by color" and frame.colors is None)
+        or (chain in ("by labels", "balanced") and frame.labels is None)
+        or (chain == "by confidence" and frame.confidence is None)
+    )
+
+
+def step_by_step(chain: Compose, data: Any) -> PointCloud:
+    *_, (_, cloud) = chain.step_through(data, generator=torch.Generator().manual_seed(0))
+    return cloud
+
+
+def run(chain: Compose, data: Any) -> PointCloud:
+    return chain(data, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.fixture(autouse=True)
+def small_ones_too(monkeypatch):
+    monkeypatch.setattr(fused, "_MIN_ROWS", 1)
+
+
+@pytest.fixture(params=["kernels", "references"])
+def bodies(request, monkeypatch) -> None:
+    """Once with the compiled kernels and once without."""
+    if request.param == "references":
+        monkeypatch.setattr("pcdata.contracts.dispatch.AUTO_ORDER", {})
+    elif why_unavailable("cpu") is not None:
+        pytest.skip(str(why_unavailable("cpu")))
+
+
+@pytest.fixture
+def together(monkeypatch) -> list[list[str]]:
+    """The steps of each run of selections that came to its end."""
+    found: list[list[str]] = []
+
+    def noted(steps, positions, *others):
+        cloud = fused.run_selections(steps, positions, *others)
+        if cloud is not None:
+            found.append([type(steps[position]).__name__ for position in positions])
+        return cloud
+
+    monkeypatch.setattr("pcdata.transforms.compose.run_selections", noted)
+    return found
+
+
+@pytest.mark.usefixtures("bodies")
+@pytest.mark.parametrize("frame", ["full", "without colors", "without anything", "one view"])
+@pytest.mark.parametrize("chain", CHAINS)
+def test_captures_come_to_what_the_steps_give(chain, frame):
+    steps, capture = Compose(CHAINS[chain]), frames()[frame]
+    if fits(chain, capture):
+        expected = step_by_step(steps, capture)
+        result = run(steps, capture)
+        assert_same(result, expected)
+        assert list(result.fields()) == list(expected.fields())
+        assert result.num_points > 0
+
+
+def whole_cloud() -> PointCloud:
+    cloud = EstimateNormals(radius=0.1)(run(Compose([Deproject(), CROP]), FULL))
+    weight = torch.linspace(0, 1, cloud.num_points, dtype=torch.float64)
+    return cloud.with_extra("weight", weight, Kind.INVARIANT).with_extra("seen", cloud.points * 2, Kind.POSITION)
+
+
+@pytest.mark.usefixtures("bodies")
+@pytest.mark.parametrize("chain", ["usual", "by labels", "by confidence", "by color", "balanced", "short", "zeros"])
+def test_clouds_come_to_what_the_steps_give(chain, together):
+    steps = Compose([step for step in CHAINS[chain] if isinstance(step, SelectTransform)])
+    cloud = whole_cloud()
+    expected = step_by_step(steps, cloud)
+    result = run(steps, cloud)
+    assert_same(result, expected)
+    assert list(result.fields()) == list(expected.fields())
+    assert len(together) == 1
+    assert_same(cloud, whole_cloud())
+
+
+def test_the_usual_steps_run_together_and_are_told_one_by_one(together):
+    told = []
+    chain = Compose(CHAINS["usual"])
+    chain.run_in_passes(FULL, after=lambda steps, cloud: told.append((steps, cloud.num_points, sorted(cloud.fields()))))
+    assert together == [[type(step).__name__ for step in CHAINS["usual"][3:]]]
+    lean = ["points", "source_index"]
+    history = step_by_step(chain, FULL).history
+    points = [sum(of_cloud[-6 + step]["points"] for of_cloud in history) for step in range(1, 6)]
+    positions = [range(3), *[range(number, number + 1) for number in range(3, 7)]]
+    assert told == [(steps, count, lean) for steps, count in zip(positions, points, strict=True)]
+
+
+def refusals() -> dict[str, list[Any]]:
+    far = CropPolygon(frame="camera", polygon=((5, 5), (6, 5), (6, 6)))
+    return {
+        "nothing left": [Deproject(), CROP, RemoveDuplicates(), far, *USUAL],
+        "too few": [Deproject(), CROP, RemoveDuplicates(), FarthestPointSample(num_points=10**6)],
+        "a limit": [Deproject(), CROP, RemovePlane(num_hypotheses=20, max_drop=0.01), RemoveDuplicates()],
+        "another frame": [
+            Deproject(),
+            CROP,
+            RemoveDuplicates(),
+            RemovePlane(up=(0, 0, 1), frame="camera", keep="above"),
+        ],
+    }
+
+
+def said_by(call: Callable[[], Any]) -> list[str]:
+    with pytest.raises(ValueError) as caught:  # noqa: PT011 - its text is what is compared
+        call()
+    return [type(caught.value).__name__, str(caught.value), *getattr(caught.value, "__notes__", [])]
+
+
+@pytest.mark.usefixtures("bodies")
+@pytest.mark.parametrize("case", ["nothing left", "too few", "a limit"])
+@pytest.mark.parametrize("given", ["capture", "cloud"])
+def test_the_step_that_refuses_says_so_itself(case, given, together):
+    steps = refusals()[case]
+    chain, data = Compose(steps), FULL
+    if given == "cloud":
+        chain, data = Compose([step for step in steps if isinstance(step, SelectTransform)]), whole_cloud()
+    said = said_by(lambda: run(chain, data))
+    assert said == said_by(lambda: step_by_step(chain, data))
+    assert any("colors" in line for line in said)  # the note tells all fields
+    assert not together
+
+
+def test_a_warning_that_is_an_error_comes_from_the_step_itself(together):
+    chain = Compose([Deproject(), CROP, RemoveDuplicates(), RemovePlane(max_drop=0.01, drop_alarm="warn")])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(Warning, match="are removed") as caught:
+            chain(FULL)
+        assert any("colors" in line for line in caught.value.__notes__)
+    assert not together
+    with pytest.warns(Warning, match="are removed"):
+        assert_same(chain(FULL), chain(FULL))
+
+
+def test_a_subclass_or_a_hook_is_not_passed_over(together):
+    class Reddish(RemoveDuplicates):
+        def pick(self, cloud, streams):
+            keep = cloud.colors[:, 0] > 0.5
+            return keep, ptr_after_mask(keep, cloud.ptr)
+
+    del REGISTRY["Reddish"]
+    chain = Compose([Deproject(), CROP, Reddish(), RemoveDuplicates(), RemoveDuplicates()])
+    assert_same(chain(FULL), step_by_step(chain, FULL))
+    assert together == [["RemoveDuplicates", "RemoveDuplicates"]]
+    seen = []
+    watched = Compose([Deproject(), CROP, RemoveDuplicates(), RemoveDuplicates()])
+    watched.steps[2].register_forward_hook(lambda step, given, cloud: seen.append(sorted(cloud.fields())))
+    watched(FULL)
+    assert seen == [["colors", "confidence", "labels", "points", "source_index"]]
+
+
+@pytest.mark.parametrize("example", SELECTIONS.values(), ids=SELECTIONS.keys())
+def test_a_selection_looks_at_no_field_that_it_does_not_name(example):
+    step, cloud = example.transform, example.make((120, 90))
+    named = step.looks_at()
+    gone = {name: None for name in ("colors", "normals", "labels", "source_index") if name not in named}
+    kept = {name: value for name, value in cloud.extra.items() if name in named}
+    kinds = {name: cloud.kinds[name] for name in kept}
+    lean = dataclasses.replace(cloud, **gone, extra=kept, kinds=kinds)
+    streams = (Streams.of(torch.Generator().manual_seed(0), 2) if step.is_random else step.no_streams for _ in range(2))
+    whole, part = (step.make_params(data, own) for data, own in zip((cloud, lean), streams))
+    assert whole.keys() == part.keys()
+    for name, value in whole.items():
+        assert torch.equal(value, part[name]), name
+
+
+def test_memory_that_requires_a_gradient_is_picked_with_it():
+    cloud = dataclasses.replace(whole_cloud(), colors=whole_cloud().colors.clone().requires_grad_())
+    chain = Compose([RemoveDuplicates(), RemoveRadiusOutliers(min_neighbors=2, radius=0.05)])
+    result = chain(cloud)
+    result.colors.sum().backward()
+    assert int((cloud.colors.grad == 1).sum()) == 3 * result.num_points
+
+
+def test_a_field_of_the_number_cannot_be_anybodys():
+    with pytest.raises((ConfigError, TypeError), match="cannot name"):
+        whole_cloud().with_extra(fused._NUMBER, torch.zeros(whole_cloud().num_points), Kind.INVARIANT)
