@@ -1,4 +1,4 @@
-"""Count the Python calls of pcdata on its three paths, and the source files that they lie in.
+"""Count the Python calls of pcdata on its four paths, and the source files that they lie in.
 
     python benchmarks/calls.py            # prints a table; --where also tells which functions are called most
     python benchmarks/calls.py --out benchmarks/results/calls.json
@@ -10,6 +10,7 @@ as one. Every path runs once before it is counted, so imports and caches do not 
 * ``points``: a depth image, color and a pose in NumPy become 1,024 points in the robot's frame (five steps).
 * ``build``: one capture of a folder becomes a dataset, by ``configs/tabletop_policy.yaml``.
 * ``open``: that dataset is opened.
+* ``live``: a frame of a stream goes through mask, flying pixels, crop, both outlier filters, farthest points, normals.
 """
 
 from __future__ import annotations
@@ -28,11 +29,15 @@ from typing import Any
 import numpy as np
 
 import pcdata
+from pcdata.live import LivePipeline
 from pcdata.synthetic import tabletop
 
 ROOT = Path(__file__).resolve().parents[1]
 _OWN = str(Path(pcdata.__file__).parent)
 SIZE = (120, 160)
+LIVE_SIZE = (240, 320)  # so many pixels that selections are run together
+
+_BY_TIME = ("_polls",)  # the core asks for Ctrl-C every 20 ms: how often, the load of the machine tells
 
 Calls = Counter[tuple[str, str]]  # (file, function) -> entries
 
@@ -43,7 +48,7 @@ def counted(path: Callable[[], Any]) -> Calls:
 
     def note(frame: Any, event: str, _: Any) -> None:
         code = frame.f_code
-        if event == "call" and code.co_filename.startswith(_OWN):
+        if event == "call" and code.co_filename.startswith(_OWN) and code.co_name not in _BY_TIME:
             calls[code.co_filename[len(_OWN) + 1 :], code.co_name] += 1
 
     before = sys.getprofile()
@@ -80,6 +85,31 @@ def points_path() -> Callable[[], Any]:
     return run
 
 
+def live_path() -> Callable[[], Any]:
+    """Return the answer to one frame, with stamps that rise."""
+    scene = tabletop(1, num_views=1, size=LIVE_SIZE).frame
+    chain = pcdata.Compose(
+        [
+            pcdata.MaskDepth(near=0.2, far=2.0),
+            pcdata.RemoveFlyingPixels(),
+            pcdata.Deproject(),
+            pcdata.CropWorkspace(frame="camera", lower=(-0.5, -0.5, 0.2), upper=(0.5, 0.5, 1.5)),
+            pcdata.RemoveStatisticalOutliers(),
+            pcdata.RemoveRadiusOutliers(),
+            pcdata.FarthestPointSample(num_points=1024),
+            pcdata.EstimateNormals(),
+        ]
+    )
+    live, stamps = LivePipeline(chain, like=scene, same_pixels=False), itertools.count()
+
+    def run() -> None:
+        cloud = live(scene, stamp=float(next(stamps))).cloud
+        assert cloud is not None
+        assert cloud.num_points == 1024
+
+    return run
+
+
 def dataset_paths(folder: Path) -> tuple[Callable[[], Any], Callable[[], Any]]:
     """Return the build of a dataset out of one capture, and its opening."""
     scene = tabletop(1, num_views=1, size=SIZE).frame
@@ -99,8 +129,8 @@ def measure() -> dict[str, Calls]:
     """Return the calls of every path, the second time it runs."""
     with tempfile.TemporaryDirectory() as folder:
         build, opening = dataset_paths(Path(folder))
-        found = {}
-        for name, path in {"points": points_path(), "build": build, "open": opening}.items():
+        found, arrays = {}, {"points": points_path(), "live": live_path()}
+        for name, path in {**arrays, "build": build, "open": opening}.items():
             path()
             found[name] = counted(path)
         return found

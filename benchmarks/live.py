@@ -7,22 +7,28 @@ The chain: mask, crop, flying pixels, both outlier filters, plane, 1,024 farthes
 room (``seven_scenes``) and a tabletop (``tabletop_stream``) resized to 848x480, and synthetic scenes; each through a
 workspace as a robot there would have. Every frame of them goes through the offline pipeline too, and the clouds must be
 identical. Wall time is that of ``LivePipeline``, one frame after another without pause. Processor time is of all
-threads of the process and says what a busy machine does not blur.
+threads of the process and says what a busy machine does not blur; of it, what is not spent in functions of the compiled
+core is told as ``around``: Python, torch, memory that is given back. Small frames, on which kernels cost next to
+nothing, tell the same of each step once more.
 
-Resident memory is looked at after 100 and after 10,000 small frames through the same chain.
+Memory is looked at after 100 and after 10,000 small frames through the same chain, and must not have grown.
 
 ``--camera 60`` replays the frames by a thread at so many frames a second for ``--seconds`` beside a busy second
-process, and counts what is dropped.
+process, and counts what is dropped: no frame may be served twice, after a newer one, or when it has lain too long, and
+none that came may be waited for.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
 import gc
 import itertools
 import json
 import multiprocessing
 import os
+import re
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -34,6 +40,7 @@ import torch
 from timing import RESULTS, facts
 
 import pcdata
+from pcdata.kernels.cpu import native
 from pcdata.live import LatestFrame, LivePipeline, LiveResult
 from pcdata.report import text_table
 from pcdata.synthetic import tabletop
@@ -51,8 +58,11 @@ SETS: dict[str, Box] = {  # the workspace in the camera's frame, metres
 }
 
 
-def chain(box: Box) -> pcdata.Compose:
-    """The steps of the measurement; the search for the plane stops when a better one is unlikely to be missed."""
+def chain(box: Box, *, radius: float = 0.01, num_points: int = 1024) -> pcdata.Compose:
+    """The steps of the measurement; the search for the plane stops when a better one is unlikely to be missed.
+
+    Small frames have their points further apart, and fewer of them.
+    """
     return pcdata.Compose(
         [
             pcdata.MaskDepth(near=0.2, far=3.0),
@@ -60,9 +70,9 @@ def chain(box: Box) -> pcdata.Compose:
             pcdata.Deproject(),
             pcdata.CropWorkspace(frame="camera", lower=box[0], upper=box[1]),
             pcdata.RemoveStatisticalOutliers(),
-            pcdata.RemoveRadiusOutliers(),
+            pcdata.RemoveRadiusOutliers(radius=radius),
             pcdata.RemovePlane(probability=0.9999),
-            pcdata.FarthestPointSample(num_points=1024),
+            pcdata.FarthestPointSample(num_points=num_points),
             pcdata.EstimateNormals(),
         ]
     )
@@ -105,16 +115,41 @@ class Measured:
         self.seconds: list[float] = []
         self.processor: list[float] = []
         self.points: list[int] = []
-        self.steps: dict[str, tuple[list[float], list[float]]] = {}  # wall and processor seconds
+        self.steps: dict[str, tuple[list[float], ...]] = {}  # seconds by the wall, of processors, of these around
 
     def add(self, other: Measured) -> None:
         self.seconds += other.seconds
         self.processor += other.processor
         self.points += other.points
-        for name, (wall, processor) in other.steps.items():
-            mine = self.steps.setdefault(name, ([], []))
-            mine[0].extend(wall)
-            mine[1].extend(processor)
+        for name, taken in other.steps.items():
+            for mine, more in zip(self.steps.setdefault(name, ([], [], [])), taken):
+                mine.extend(more)
+
+
+class InCore:
+    """Adds up the processor seconds of functions of the compiled core, while it is entered."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def __enter__(self) -> InCore:
+        self._before = dict(native.library())
+        for name, function in self._before.items():
+            native.library()[name] = function._replace(entry=self._timed(function.entry))
+        return self
+
+    def __exit__(self, *raised: object) -> None:
+        native.library().update(self._before)
+
+    def _timed(self, entry: Callable[..., int]) -> Callable[..., int]:
+        def timed(*arguments: Any) -> int:
+            since = time.process_time()
+            try:
+                return entry(*arguments)
+            finally:
+                self.seconds += time.process_time() - since
+
+        return timed
 
 
 def check_identical(live: LivePipeline, frame: pcdata.DepthFrame, offline: pcdata.Compose) -> None:
@@ -136,20 +171,22 @@ def cloud_of(answer: LiveResult) -> pcdata.PointCloud:
 def by_steps(steps: pcdata.Compose, frame: pcdata.DepthFrame, measured: Measured) -> None:
     """Run the chain once more and note what each pass took."""
     names = [type(step).__name__ for step in steps.steps]
-    since = time.perf_counter(), time.process_time()
+
+    def now() -> tuple[float, float, float]:
+        return time.perf_counter(), time.process_time(), core.seconds
 
     def after(positions: range, data: Any) -> None:
         nonlocal since
-        now = time.perf_counter(), time.process_time()
+        wall, processor, within = (end - begin for end, begin in zip(now(), since))
         name = " + ".join(names[k] for k in positions)
-        wall, processor = measured.steps.setdefault(name, ([], []))
-        wall.append(now[0] - since[0])
-        processor.append(now[1] - since[1])
+        for taken, seconds in zip(measured.steps.setdefault(name, ([], [], [])), (wall, processor, processor - within)):
+            taken.append(seconds)
         if name.endswith("CropWorkspace"):
             measured.points.append(data.num_points)
-        since = time.perf_counter(), time.process_time()
+        since = now()
 
-    with torch_on_one_thread():
+    with torch_on_one_thread(), torch.no_grad(), InCore() as core:
+        since = now()
         steps.run_in_passes(frame, after=after)
 
 
@@ -183,13 +220,42 @@ def summary(measured: Measured) -> dict[str, Any]:
         "wall": figures(measured.seconds),
         "processor": figures(measured.processor),
         "steps": {
-            name: {"wall": figures(wall), "processor": figures(processor)}
-            for name, (wall, processor) in measured.steps.items()
+            name: {"wall": figures(wall), "processor": figures(processor), "around": figures(around)}
+            for name, (wall, processor, around) in measured.steps.items()
         },
     }
 
 
+# -- around the kernels ------------------------------------------------------------------------------------------------
+
+
+def small_frames(size: tuple[int, int]) -> list[pcdata.DepthFrame]:
+    scene = tabletop(0, noise="stereo", size=size, num_views=1)
+    return [replace(scene.render(seed_noise=number), labels=None) for number in range(8)]
+
+
+def small_chain() -> pcdata.Compose:
+    return chain(SETS["synthetic"], radius=0.05, num_points=64)
+
+
+def around_kernels(count: int) -> dict[str, float]:
+    """The processor microseconds of each step of small frames, on one thread, that are not the core's: the median."""
+    measured, before = Measured(), torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        steps = small_chain()
+        for number, frame in zip(range(count), itertools.cycle(small_frames((48, 64)))):
+            measured = Measured() if number == 10 else measured  # after those that warm up
+            by_steps(steps, frame, measured)
+    finally:
+        torch.set_num_threads(before)
+    return {name: 1e6 * float(np.median(around)) for name, (_, _, around) in measured.steps.items()}
+
+
 # -- a camera thread ---------------------------------------------------------------------------------------------------
+
+MAX_AGE = 0.1  # seconds that a frame may have lain when it is taken
+STALL = 1.0  # seconds without an answer in which none is worked on
 
 
 def keep_busy() -> None:
@@ -209,33 +275,47 @@ def replay(frames: list[pcdata.DepthFrame], box: Box, rate: float, seconds: floa
 
 
 def replay_beside(frames: list[pcdata.DepthFrame], box: Box, rate: float, seconds: float) -> dict[str, Any]:
-    live = LivePipeline(chain(box), like=frames[0], max_age=1.0, same_pixels=False)  # a few frames, again and again
-    with LatestFrame.reading(camera_at(frames, rate, seconds), timeout=1.0) as camera:
-        stamps, ages = [], []
+    live = LivePipeline(chain(box), like=frames[0], same_pixels=False)  # a few frames again and again
+    given: list[float] = []
+    answers: list[LiveResult] = []
+    moments = []
+    with LatestFrame.reading(camera_at(frames, rate, seconds, given), timeout=STALL, max_age=MAX_AGE) as camera:
         for answer in live.follow(camera):
+            answers.append(replace(answer, cloud=None))
+            moments.append(time.monotonic())
             assert answer.fault is None, f"{answer.fault}: {answer.reason}"
-            stamps.append(answer.stamp)
-            ages.append(answer.age)
-        given = camera.given
-    assert stamps == sorted(set(stamps)), "a frame was served twice, or after a newer one"
+    stamps = [answer.stamp or 0.0 for answer in answers]
+    ages = [answer.age or 0.0 for answer in answers]
+    lain = [age - answer.seconds for age, answer in zip(ages, answers)]
+    gaps = np.diff(moments)
+    waited = gaps - [answer.seconds for answer in answers[1:]]
     stats = live.stats()
+    assert stamps == sorted(set(stamps)), "a frame was served twice, or after a newer one"
+    assert waited.max() < STALL, "it stalled"
+    assert camera.given == len(given) == stats.clouds + stats.dropped, "a frame was neither answered nor counted"
     return {
         "rate": rate,
-        "given": given,
+        "seconds": seconds,
+        "given": camera.given,
         "answered": stats.clouds,
         "dropped": stats.dropped,
         "faults": dict(stats.faults),
         "age": figures(ages),
+        "age_when_taken": figures(lain),
+        "between_answers": figures(gaps.tolist()),
     }
 
 
-def camera_at(frames: list[pcdata.DepthFrame], rate: float, seconds: float) -> Callable[[], pcdata.DepthFrame]:
-    """Return what gives the next frame when it is due."""
+def camera_at(
+    frames: list[pcdata.DepthFrame], rate: float, seconds: float, given: list[float]
+) -> Callable[[], pcdata.DepthFrame]:
+    """Return what gives the next frame when it is due, and notes when."""
     started = time.monotonic()
 
     def due() -> Iterator[pcdata.DepthFrame]:
         for number, frame in zip(range(int(rate * seconds)), itertools.cycle(frames)):
             time.sleep(max(0.0, started + number / rate - time.monotonic()))
+            given.append(time.monotonic())
             yield frame
 
     return due().__next__
@@ -243,24 +323,54 @@ def camera_at(frames: list[pcdata.DepthFrame], rate: float, seconds: float) -> C
 
 # -- memory -----------------------------------------------------------------------------------------------------------
 
+# Bytes that may be in use more after 10,000 frames than after 100: torch keeps the Python objects of tensors to use
+# them again, and their number rises, ever more slowly, to the most that were there at once.
+_KEPT_BY_TORCH = 64 << 10
+# Of resident memory: what malloc cannot give back as small pieces lie between free ones; it too comes to an end.
+_BETWEEN_PIECES = 2 << 20
 
-def memory(quick: bool) -> dict[str, int]:
-    """Bytes that are resident after 100 small frames, and after many."""
-    scene = tabletop(0, noise="stereo", size=(180, 318), num_views=1)
-    some = [replace(scene.render(seed_noise=number), labels=None) for number in range(8)]
-    steps = chain(SETS["synthetic"])
-    live = LivePipeline(steps, like=some[0])
-    found, count = {}, 200 if quick else 10_000
+
+def memory(quick: bool) -> dict[str, dict[str, int]]:
+    """Bytes in use and resident after 104 small frames, after half, and after many; none may be one of a frame."""
+    some = small_frames((60, 80))
+    live = LivePipeline(small_chain(), like=some[0])
+    found: dict[str, dict[str, int]] = {}
+    count = 400 if quick else 10_000
     for number, frame in zip(range(1, count + 1), itertools.cycle(some)):
         cloud_of(live(frame))
-        if number in (100, count // 2, count):
+        if number in (104, count // 2, count):
             gc.collect()
-            found[f"bytes_after_{number}"] = resident()
+            found[f"after_{number}"] = {
+                "in_use": bytes_in_use(),
+                "resident": resident(),
+                "objects": len(gc.get_objects()),
+            }
+    early, half, late = found.values()
+    more = {name: late[name] - early[name] for name in early}
+    assert more["in_use"] < _KEPT_BY_TORCH, f"{more['in_use']} bytes more are in use after {count} frames"
+    assert more["resident"] < _BETWEEN_PIECES, f"{more['resident']} bytes more are resident after {count} frames"
+    assert more["objects"] <= 8, f"{more['objects']} Python objects more are there after {count} frames"
+    if not quick:  # what is left to be kept is kept in the first half
+        assert late["in_use"] - half["in_use"] < _KEPT_BY_TORCH / 8, "memory in use still grows"
     return found
 
 
 def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def bytes_in_use() -> int:
+    """Bytes that glibc's malloc has given out and not got back, in all of its arenas."""
+    libc = ctypes.CDLL(None)
+    libc.fopen.restype = ctypes.c_void_p
+    with tempfile.NamedTemporaryFile("r") as file:
+        stream = ctypes.c_void_p(libc.fopen(file.name.encode(), b"w"))
+        libc.malloc_info(0, stream)
+        libc.fclose(stream)
+        told = file.read()
+    told = told[told.rindex("</heap>") :]
+    sizes = dict(re.findall(r'type="(\w+)"(?: count="\d+")? size="(\d+)"', told))
+    return int(sizes["current"]) - int(sizes["fast"]) - int(sizes["rest"]) + int(sizes["mmap"])
 
 
 # -- telling -----------------------------------------------------------------------------------------------------------
@@ -275,6 +385,7 @@ def tell(name: str, told: dict[str, Any]) -> None:
     for step, values in told["steps"].items():
         rows.append([step, *(f"{values['wall'][f'{key}_ms']:.2f}" for key in keys)])
         rows.append(["  processor", *(f"{values['processor'][f'{key}_ms']:.2f}" for key in keys)])
+        rows.append(["  around", *(f"{values['around'][f'{key}_ms']:.2f}" for key in keys)])
     points = told["points_after_crop"]
     print(f"{name}: {told['frames']} frames, {points['median']} points after the crop ({points['most']} at most)")
     print(text_table(["ms", *keys], rows), "\n")
@@ -320,7 +431,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=2000, help="of all sets together")
     parser.add_argument("--quick", action="store_true", help="60 frames; nothing is kept")
     parser.add_argument("--camera", type=float, nargs="*", default=None, metavar="HZ", help="replay at these rates")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of each replay")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each replay")
     parser.add_argument("--out", type=Path, default=RESULTS / "live.json", help="where JSON and picture go")
     arguments = parser.parse_args()
     found = frames(arguments.quick)
@@ -338,6 +449,8 @@ def main() -> None:
     tell("all", result["all"])
     p99 = result["all"]["wall"]["p99_ms"]
     print(f"p99 {p99:.2f} ms; 60 Hz wants {1000 * BAR:.1f}, 90 Hz {1000 * STRETCH:.1f}; identical to offline: yes")
+    result["around_us"] = around_kernels(40 if arguments.quick else 400)
+    print("around the kernels, microseconds", {name: round(own) for name, own in result["around_us"].items()})
     result["memory"] = memory(arguments.quick)
     print("memory", result["memory"])
     for rate in arguments.camera or ():
