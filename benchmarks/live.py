@@ -268,7 +268,9 @@ def replay(frames: list[pcdata.DepthFrame], box: Box, rate: float, seconds: floa
     busy = multiprocessing.get_context("spawn").Process(target=keep_busy, daemon=True)
     busy.start()
     try:
-        return replay_beside(frames, box, rate, seconds)
+        told = replay_beside(frames, box, rate, seconds)
+        assert busy.is_alive(), "the second process ended, so nothing was busy beside"
+        return told
     finally:
         busy.kill()
         busy.join()
@@ -326,8 +328,9 @@ def camera_at(
 # Bytes that may be in use more after 10,000 frames than after 100: torch keeps the Python objects of tensors to use
 # them again, and their number rises, ever more slowly, to the most that were there at once.
 _KEPT_BY_TORCH = 64 << 10
-# Of resident memory: what malloc cannot give back as small pieces lie between free ones; it too comes to an end.
-_BETWEEN_PIECES = 2 << 20
+# Resident memory that may be more: malloc cannot give pages back where small pieces lie between free ones. It grows
+# ever more slowly, 3 MB on a machine so busy that threads seldom meet; an image a frame would be 190 MB.
+_BETWEEN_PIECES = 4 << 20
 
 
 def memory(quick: bool) -> dict[str, dict[str, int]]:

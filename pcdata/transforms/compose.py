@@ -114,7 +114,7 @@ class Compose(Transform):
         """Run every step as :meth:`forward` does; call ``after(positions of the steps, data)`` behind each pass.
 
         Several steps may be one pass, so what lies between them is never made, and between selections fields that none
-        of them looks at are missing: :meth:`step_through` makes all.
+        of them looks at are missing: :meth:`step_through` makes all. It may look at data alone.
         """
         return self._run(data, generator, after=after)
 
