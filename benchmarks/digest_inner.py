@@ -35,6 +35,22 @@ def _fields() -> dict[str, Tensor]:
     return {"points": points(90, 1), "labels": torch.arange(90), "byte": torch.arange(90).to(torch.uint8)}
 
 
+def _depth_filters() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
+    depth = rendered(2, 5).depth
+    depth = torch.where(torch.rand(depth.shape, generator=seeded(9)) < 0.2, 0.0, depth)
+    seen = torch.randint(0, 256, depth.shape, generator=seeded(10), dtype=torch.uint8)
+    scale, last = torch.tensor([3.0, 5.0]), depth.flip(2)
+    yield "reciprocals", "two", lambda: ((depth, scale), {})
+    yield "smoothed_images", "values", lambda: ((depth, None, 0.5, 0.01, 2), {})
+    yield "smoothed_images", "reciprocals", lambda: ((depth, scale, 0.5, 0.1, 2), {})
+    yield "temporal_step", "values", lambda: ((depth, None, last, seen, 0.4, 0.01, 3), {})
+    yield "temporal_step", "reciprocals", lambda: ((depth, scale, last, seen, 0.4, 0.1, 5), {})
+    yield "without_flying_pixels", "confidence", lambda: ((depth, seen % 4, 0.02, 3), {})
+    yield "fill_rows", "three", lambda: ((depth, 3), {})
+    yield "filled_images", "farthest", lambda: ((depth, "farthest", 4, 1), {})
+    yield "filled_confidence", "two", lambda: ((depth, last, seen % 4, seen > 99), {})
+
+
 def _parts() -> dict[str, list[Tensor]]:
     return {name: [field[:50], field[50:]] for name, field in _fields().items()}
 
@@ -106,6 +122,7 @@ def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     yield "inside_box", "not finite", lambda: ((spoilt, (0.0,) * 3, (1.0,) * 3), {})
     yield "mask_depth", "range", lambda: ((rendered(2, 5).depth, 0.5, 0.9, None), {})
     yield "mask_depth", "mask", lambda: ((rendered(2, 5).depth, None, None, _mask()), {})
+    yield from _depth_filters()
     for lens in ("pinhole", "lens"):
         yield "deproject_images", lens, partial(_images, lens)
         yield "deproject_into_box", f"{lens} camera", partial(_into_box, lens, moved=False)

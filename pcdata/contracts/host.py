@@ -29,6 +29,13 @@ def any_negative(values: Tensor) -> bool:
     return bool((values < 0).any())
 
 
+def any_above(values: Tensor, limit: int) -> bool:
+    """Say whether a whole number is above a limit."""
+    if values.device.type == "cpu":
+        return bool(np.logical_or.reduce(values.numpy() > limit, axis=None))
+    return bool((values > limit).any())
+
+
 def count_true(mask: Tensor) -> int:
     """Count the true values of a mask."""
     return int(np.count_nonzero(mask.numpy())) if mask.device.type == "cpu" else int(mask.sum())

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from pcdata.contracts.host import any_negative
+from pcdata.contracts.host import any_above, any_negative
 from pcdata.contracts.known import FINITE, NOT_NEGATIVE, is_known, note
 from pcdata.contracts.lengths import check_depth
 from pcdata.contracts.tensors import check_tensors
@@ -101,7 +101,7 @@ class DepthFrame(Structure):
         # Some thousand pixels tell the median; on a GPU they are one small copy.
         some = self.depth.flatten()[:: max(1, self.depth.numel() // _SAMPLE)].detach().cpu().numpy()
         check_depth(where, some[some > 0])
-        if self.confidence is not None and bool((self.confidence > max(Confidence)).any()):
+        if self.confidence is not None and any_above(self.confidence, int(max(Confidence))):
             raise CaptureError(
                 f"{where}: confidence must hold the values of Confidence, 0 .. {max(Confidence)}, got "
                 f"{int(self.confidence.max())}; translate a sensor's own confidence where it is read"

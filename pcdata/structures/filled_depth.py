@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from pcdata.contracts.dispatch import inner
 from pcdata.structures.confidence import Confidence
 from pcdata.structures.depth_frame import DepthFrame
 
@@ -21,16 +22,34 @@ def confidence_of(frame: DepthFrame) -> Tensor:
 def with_filled_depth(
     frame: DepthFrame,
     depth: Tensor,  # (V, H, W) float32 metres, of the frame's size
-    filled: Tensor,  # (V, H, W) bool: this depth is a guess where the frame has no reading
-    hallucinated: Tensor | None = None,  # (V, H, W) bool: those of them that no reading nearby supports
+    hallucinated: Tensor | None = None,  # (V, H, W) bool: filled where no reading nearby supports it
 ) -> DepthFrame:
-    """Return the frame with another depth; filled pixels become COMPLETED, or HALLUCINATED where they are said to be.
+    """Return the frame with another depth; pixels that had none become COMPLETED, or HALLUCINATED where said to be.
 
     A frame without confidence in which nothing is filled stays without.
     """
-    if frame.confidence is None and not bool(filled.any()):
-        return replace(frame, depth=depth)
-    confidence = torch.where(filled, int(Confidence.COMPLETED), confidence_of(frame))
+    confidence = filled_confidence(frame.depth, depth, frame.confidence, hallucinated)
+    return replace(frame, depth=depth, confidence=confidence)
+
+
+@inner
+def filled_confidence(
+    before: Tensor, after: Tensor, confidence: Tensor | None, hallucinated: Tensor | None
+) -> Tensor | None:
+    """Return the (V, H, W) uint8 confidence once depths were filled, None if there was none and nothing was.
+
+    Args:
+        before: (V, H, W) float32, 0 = no reading.
+        after: filled.
+        confidence: (V, H, W) uint8 before; None = readings are RELIABLE.
+        hallucinated: (V, H, W) bool; None = nowhere.
+    """
+    filled = (before == 0) & (after > 0)
+    if confidence is None:
+        if not bool(filled.any()):
+            return None
+        confidence = (before > 0).to(torch.uint8) * int(Confidence.RELIABLE)
+    guess: int | Tensor = int(Confidence.COMPLETED)
     if hallucinated is not None:
-        confidence = torch.where(filled & hallucinated, int(Confidence.HALLUCINATED), confidence)
-    return replace(frame, depth=depth, confidence=confidence.to(torch.uint8))
+        guess = torch.where(hallucinated, int(Confidence.HALLUCINATED), guess)
+    return torch.where(filled, guess, confidence).to(torch.uint8)

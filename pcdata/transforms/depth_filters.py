@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-import torch
 from annotated_types import Ge, Gt, Interval, Le
 
-from pcdata.contracts.host import negated
-from pcdata.functional.depth.disparity import depth_to_disparity, disparity_to_depth, spatial_filter
-from pcdata.functional.depth.flying_pixels import flying_pixel_mask
-from pcdata.functional.depth.holes import fill_holes, fill_rows
-from pcdata.structures import Confidence, DepthFrame
+from pcdata.contracts.known import FINITE, NOT_NEGATIVE, is_known, note
+from pcdata.functional.depth.disparity import disparity_scale, reciprocals, smoothed_images
+from pcdata.functional.depth.flying_pixels import without_flying_pixels
+from pcdata.functional.depth.holes import fill_rows, filled_images
+from pcdata.structures import DepthFrame
 from pcdata.structures.filled_depth import with_filled_depth
-from pcdata.structures.structure import derived
+from pcdata.structures.structure import checked_copy, derived
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.families import MaskTransform
 from pcdata.transforms.field_types import Count, FromSensor, Metres, Positive
@@ -43,13 +42,15 @@ class SpatialFilterDepth(Transform):
 
     def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Filter all views in one call."""
-        focal = data.camera.intrinsics[:, 0, 0].to(data.device)
-        disparity = depth_to_disparity(data.depth, focal, self.baseline)
-        disparity = spatial_filter(disparity, alpha=self.alpha, delta=self.delta, iterations=self.iterations)
-        if self.hole_fill_radius:
-            disparity = fill_rows(disparity, self.hole_fill_radius)
-        depth = disparity_to_depth(disparity, focal, self.baseline)
-        return with_filled_depth(data, depth, (depth > 0) & (data.depth == 0))
+        scale = disparity_scale(data.camera.intrinsics[:, 0, 0].to(data.device), self.baseline)
+        if not self.hole_fill_radius:
+            depth = smoothed_images(data.depth.detach(), scale, self.alpha, self.delta, self.iterations)
+            return checked_copy(data, depth=depth)
+        disparity = smoothed_images(
+            reciprocals(data.depth.detach(), scale), None, self.alpha, self.delta, self.iterations
+        )
+        depth = reciprocals(fill_rows(disparity, self.hole_fill_radius), scale)
+        return with_filled_depth(data, depth)
 
 
 class FillHoles(Transform):
@@ -73,8 +74,8 @@ class FillHoles(Transform):
 
     def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Fill all views in one call."""
-        depth, distance = fill_holes(data.depth, rule=self.rule, max_size=self.max_size)
-        return with_filled_depth(data, depth, distance > 0, distance > self.max_distance)
+        depth, far = filled_images(data.depth, self.rule, self.max_size, self.max_distance)
+        return with_filled_depth(data, depth, far)
 
 
 class RemoveFlyingPixels(MaskTransform):
@@ -93,9 +94,8 @@ class RemoveFlyingPixels(MaskTransform):
 
     def transform(self, data: DepthFrame, params: Params) -> DepthFrame:
         """Blank the flying pixels of all views."""
-        flying = flying_pixel_mask(data.depth, tolerance=self.tolerance, min_neighbors=self.min_neighbors)
-        left = data.masked(mask=negated(flying))
-        if data.confidence is None:
-            return left
-        confidence = torch.where(flying, int(Confidence.NO_READING), data.confidence).to(torch.uint8)
-        return derived(left, confidence=confidence)
+        depth, confidence = without_flying_pixels(data.depth, data.confidence, self.tolerance, self.min_neighbors)
+        for fact in (FINITE, NOT_NEGATIVE):
+            if is_known(fact, data.depth):
+                note(fact, depth)
+        return derived(data, depth=depth, confidence=confidence)

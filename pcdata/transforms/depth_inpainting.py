@@ -48,7 +48,7 @@ class InpaintDepth(Transform):
         depth = torch.where(hole, torch.from_numpy(filled).to(data.depth), data.depth)
         reach = 2 * self.max_distance + 1
         near = max_pool2d((~hole)[:, None].float(), reach, 1, self.max_distance)[:, 0] > 0
-        return with_filled_depth(data, depth, hole & (depth > 0), ~near)
+        return with_filled_depth(data, depth, ~near)
 
 
 def _inpainted(cv2: Any, depth: NDArray[np.float32]) -> NDArray[np.float32]:  # (H, W) metres, 0 = hole

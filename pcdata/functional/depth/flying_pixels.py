@@ -7,7 +7,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import op
+from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_positive
 
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # half of the eight: each pair of neighbors is compared once
@@ -59,3 +59,13 @@ def flying_pixel_mask(
             on_surface[side] += same
             at_edge[side] |= edge
     return at_edge & (on_surface < min_neighbors)
+
+
+@inner
+def without_flying_pixels(
+    depth: Tensor, confidence: Tensor | None, tolerance: float, min_neighbors: int
+) -> tuple[Tensor, Tensor | None]:
+    """Return depth (V, H, W) with 0 at its flying pixels, and its confidence (V, H, W) uint8, if any, as well."""
+    flying = flying_pixel_mask(depth, tolerance=tolerance, min_neighbors=min_neighbors)
+    marks = None if confidence is None else torch.where(flying, 0, confidence).to(torch.uint8)
+    return torch.where(flying, 0.0, depth), marks

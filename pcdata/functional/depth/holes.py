@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import op
+from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_word
 
 RULES = ("left", "farthest", "nearest")
@@ -46,6 +46,16 @@ def fill_holes(
     return _fill_inwards(depth, wanted, farthest=rule == "farthest")
 
 
+@inner
+def filled_images(
+    depth: Tensor, rule: Literal["left", "farthest", "nearest"], max_size: int | None, max_distance: int
+) -> tuple[Tensor, Tensor]:
+    """Return what :func:`fill_holes` gives, and where (V, H, W) the distance is above a limit, instead of it."""
+    filled, distance = fill_holes(depth, rule=rule, max_size=max_size)
+    return filled, distance > max_distance
+
+
+@inner
 def fill_rows(values: Tensor, radius: int) -> Tensor:
     """Fill up to ``radius`` pixels of every gap in a row from its left side, then as many from its right side.
 

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pcdata.contracts.dispatch import inner
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, DTypeError
+from pcdata.functional.depth.disparity import reciprocals
 
 # librealsense's persistence rules: a pixel without a reading repeats its last value if it had at least `needed`
 # readings in the last `frames` frames before this one.
@@ -73,22 +75,66 @@ def temporal_filter(
         raise ConfigError(
             f"{where}: needs 0 < alpha <= 1, delta > 0 and persistence 0..8, got {alpha}, {delta}, {persistence!r}"
         )
-    if state is not None and not isinstance(state, TemporalState):
-        raise DTypeError(f"{where}: state must be what the call before returned, or None, not {type(state).__name__}")
-    known = {"values": values} if state is None else {"values": values, "last": state.last, "history": state.history}
-    check_tensors(where, known, {"values": "V H W : depth", "last": "V H W", "history": "V H W : uint8"})
+    check_tensors(where, {"values": values}, {"values": "V H W : depth"})
+    state = checked_state(where, "values", values, state)
+    filtered, last, seen = temporal_step(values, None, state.last, state.history, alpha, delta, persistence)
+    return filtered, TemporalState(last=last, history=seen)
+
+
+def checked_state(where: str, name: str, values: Tensor, state: TemporalState | None) -> TemporalState:
+    """Return the state, which must be of these images; of None, that of a stream's beginning.
+
+    Raises:
+        DTypeError: it is none.
+        ShapeError, DeviceError: it belongs to other images.
+    """
     if state is None:
         history = torch.zeros_like(values, dtype=torch.uint8)
-        state = TemporalState(last=torch.zeros_like(values), history=history)
+        return TemporalState(last=torch.zeros_like(values), history=history)
+    if not isinstance(state, TemporalState):
+        raise DTypeError(f"{where}: state must be what the call before returned, or None, not {type(state).__name__}")
+    given = {name: values, "last": state.last, "history": state.history}
+    check_tensors(
+        where, given, {name: "V H W : float32", "last": "V H W", "history": "V H W : uint8"}, check_values=False
+    )
+    return state
 
+
+@inner
+def temporal_step(
+    values: Tensor,
+    scale: Tensor | None,
+    last: Tensor,
+    history: Tensor,
+    alpha: float,
+    delta: float,
+    persistence: int,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return what :func:`temporal_filter` gives, and the ``last`` and ``history`` after it.
+
+    Args:
+        values: (V, H, W) float32, 0 = no reading; none negative.
+        scale: (V,) float32: values are depths; ``scale / depth`` is filtered and remembered, and turned back. None =
+            they are as they are.
+        last: of the state before.
+        history: of the state before.
+        alpha: as there.
+        delta: as there.
+        persistence: as there.
+    """
+    if scale is not None:
+        values = reciprocals(values, scale)
+        disparity, last, seen = temporal_step(values, None, last, history, alpha, delta, persistence)
+        return reciprocals(disparity, scale), last, seen
     valid = values > 0
-    steady = valid & (state.last > 0) & ((values - state.last).abs() < delta)
-    filtered = torch.where(steady, torch.lerp(state.last, values, alpha), values)
-    remembered = ~valid & (state.last > 0) & _credible(state.history, *PERSISTENCE_RULES[persistence])
+    steady = valid & (last > 0) & ((values - last).abs() < delta)
+    # Not lerp, which rounds once or twice as the processor has it.
+    filtered = torch.where(steady, values + (1 - alpha) * (last - values), values)
+    remembered = ~valid & (last > 0) & _credible(history, *PERSISTENCE_RULES[persistence])
     # A surface that has just appeared cannot lean on the history of the one before it.
-    past = torch.where(steady | ~valid, state.history << 1, 0)
-    after = TemporalState(last=torch.where(valid, filtered, state.last), history=past | valid.to(torch.uint8))
-    return torch.where(remembered, state.last, filtered), after
+    past = torch.where(steady | ~valid, history << 1, 0)
+    seen = past | valid.to(torch.uint8)
+    return torch.where(remembered, last, filtered), torch.where(valid, filtered, last), seen
 
 
 def _credible(history: Tensor, needed: int, frames: int) -> Tensor:

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 from pcdata.errors import ConfigError, DTypeError
 from pcdata.files.sample_names import check_known
-from pcdata.functional.depth.disparity import depth_to_disparity, disparity_to_depth
-from pcdata.functional.depth.temporal import PERSISTENCE_RULES, TemporalState, temporal_filter
+from pcdata.functional.depth.disparity import disparity_scale
+from pcdata.functional.depth.temporal import PERSISTENCE_RULES, TemporalState, checked_state, temporal_step
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids, recordings_of, signals_of
 from pcdata.io.sources.combine import CombinedSource
 from pcdata.io.sources.option_checks import check_numbers
@@ -56,13 +56,12 @@ class TemporalFilterDepth:
         Raises:
             ShapeError, DeviceError: the state belongs to other images.
         """
-        focal = frame.camera.intrinsics[:, 0, 0].to(frame.device)
-        disparity = depth_to_disparity(frame.depth, focal, self.baseline)
-        disparity, state = temporal_filter(
-            disparity, state, alpha=self.alpha, delta=self.delta, persistence=self.persistence
-        )
-        depth = disparity_to_depth(disparity, focal, self.baseline)
-        return with_filled_depth(frame, depth, (depth > 0) & (frame.depth == 0)), state
+        state = checked_state("TemporalFilterDepth", "depth", frame.depth, state)
+        scale = disparity_scale(frame.camera.intrinsics[:, 0, 0].to(frame.device), self.baseline)
+        rule = self.alpha, self.delta, self.persistence
+        depth, last, history = temporal_step(frame.depth, scale, state.last, state.history, *rule)
+        state = TemporalState(last=last, history=history)
+        return with_filled_depth(frame, depth), state
 
     def frames(self, frames: Iterable[DepthFrame]) -> Iterator[DepthFrame]:
         """Yield every frame of one stream filtered with those before it.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pcdata.kernels.cpu import depth_filters as cpu_depth_filters
 from pcdata.kernels.cpu import depth_to_color as cpu_registration
 from pcdata.kernels.cpu import fusion as cpu_fusion
 from pcdata.kernels.cpu import grasps as cpu_grasps
@@ -21,6 +22,7 @@ from pcdata.kernels.cpu import touching as cpu_touching
 from pcdata.kernels.cpu.native import unavailable
 
 __all__ = [
+    "cpu_depth_filters",
     "cpu_fusion",
     "cpu_grasps",
     "cpu_image_windows",

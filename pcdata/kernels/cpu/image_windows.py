@@ -26,6 +26,18 @@ def flying_pixel_mask(depth: Tensor, *, tolerance: float, min_neighbors: int) ->
     return flying
 
 
+@kernel("without_flying_pixels", "cpu")
+def without_flying_pixels(
+    depth: Tensor, confidence: Tensor | None, tolerance: float, min_neighbors: int
+) -> tuple[Tensor, Tensor | None]:
+    """Write what is left instead of a mask."""
+    kept, rule = room(depth.shape, torch.float32), (float(tolerance), min_neighbors)
+    marks = None if confidence is None else room(depth.shape, torch.uint8)
+    was = None if confidence is None else confidence.contiguous()
+    call("pc_without_flying_pixels", depth.contiguous(), *depth.shape, *rule, was, kept, marks)
+    return kept, marks
+
+
 @kernel("window_medians", "cpu")
 def window_medians(values: Tensor, points: Tensor, ptr: Tensor, grid: ImageGrid | None) -> Tensor:
     """Sort the nine values of many pixels side by side; without a grid the neighbors are those of knn."""

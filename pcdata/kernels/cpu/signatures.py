@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0xA2B4C07D479B83F
+INTERFACE_NUMBER = 0xCCC781461AB2A9B
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -47,7 +47,22 @@ pc_duplicate_mask: float* points, int64* ptr, int64 num_clouds, uint8* repeats
 pc_convex_hull: double* points, int64 count, int64* corners, int64* num_corners
 pc_points_in_grippers: float* points, int64 count, double* axes, double* origin, double* lower, double* upper, int64
     num_grasps, int64* hits, int64* held
+pc_reciprocals: float* values, float* scales, int64 views, int64 pixels, float* reciprocals
+pc_spatial_filter: float* values, float* scales, int64 views, int64 height, int64 width, double keep, double delta,
+    int64 iterations, float* smoothed
+pc_temporal_filter: float* values, float* scales, int64 views, int64 pixels, double keep, double delta, int64 needed,
+    int64 frames, float* last, uint8* history, float* filtered, float* new_last, uint8* new_history
+pc_bilateral_filter: float* depth, int64 views, int64 height, int64 width, int64 reach, float* shares, double scale,
+    double max_jump, float* smoothed
+pc_median_filter: float* depth, int64 views, int64 height, int64 width, int64 reach, double max_jump, float* found
+pc_fill_holes: float* depth, int64 views, int64 height, int64 width, int64 rule, int64 max_size, float* filled, int64*
+    distance, int64 limit, uint8* far
+pc_fill_rows: float* values, int64 rows, int64 width, int64 radius, float* filled
+pc_filled_confidence: float* before, float* after, int64 count, uint8* confidence, uint8* far, uint8* filled_confidence,
+    int64* any_filled
 pc_flying_pixels: float* depth, int64 num_views, int64 height, int64 width, double tolerance, int64 least, uint8* flying
+pc_without_flying_pixels: float* depth, int64 num_views, int64 height, int64 width, double tolerance, int64 least,
+    uint8* confidence, float* kept, uint8* kept_confidence
 pc_window_medians: float* values, int64* pixel, int64* ptr, int64 num_clouds, int64 height, int64 width, float* medians
 pc_linked_pixels: float* points, int64* pixel, int64* ptr, int64 num_clouds, int64 height, int64 width, double limit,
     int64 reach, int64* label

@@ -70,6 +70,12 @@ def test_noise_on_a_slanted_plane_goes_down_and_its_edge_stays_where_it_is():
     assert float(error[:, 70:80].abs().max()) < 10, "and none was drawn toward the other side"
 
 
+def test_without_a_threshold_holes_are_edges_all_the_same():
+    image = torch.tensor([[[4.0, 6.0, 0.0, 10.0]]])
+    found = spatial_filter(image, alpha=0.5, delta=torch.inf, iterations=1)
+    assert found.flatten().tolist() == [4.5, 5.0, 0.0, 10.0]  # forth: 4, 5; back: (4 + 5) / 2
+
+
 def test_holes_stay_holes_and_nothing_passes_through_them():
     image = torch.full((1, 9, 20), 500.0)
     image[..., 8:11] = 0

@@ -120,6 +120,16 @@ def test_noise_falls_and_edges_stand():
         assert float((filtered - clean).square().mean().sqrt()) < part * before
 
 
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e30])
+def test_sigmas_of_any_size_give_finite_means(scale):
+    depth = steps() * scale
+    for sigma in (5e-324, 1e-200, 1e-9, 1e9, 1e200):
+        found = bilateral_filter(depth, sigma_depth=sigma, sigma_pixels=sigma, max_jump=math.inf)
+        assert bool(found.isfinite().all())
+        if sigma <= 1e-200:  # nothing but the pixel itself weighs
+            assert torch.equal(found, depth)
+
+
 @pytest.mark.parametrize("function", [bilateral_filter, median_filter])
 def test_wrong_input_is_told(function):
     name = function.__name__

@@ -433,12 +433,51 @@ def fuzz_images(rng: np.random.Generator) -> None:
     check("deproject_depth", depth, intrinsics, distortion=lens)
     tolerance, least = float(rng.choice([1e-4, 0.02, 0.5])), int(rng.integers(1, 9))
     check("flying_pixel_mask", depth, tolerance=tolerance, min_neighbors=least)
+    fuzz_depth_filters(rng, depth)
     motion = torch.eye(4, dtype=torch.float64).repeat(views, 1, 1)
     motion[:, :3, 3] = torch.from_numpy(rng.normal(size=(views, 3)) * 0.05)
     size = int(rng.integers(1, 40)), int(rng.integers(1, 50))
     to_color = {"color_size": size, "distortion": lens, "color_distortion": lens}
     check("register_depth", depth, intrinsics, intrinsics, motion, **to_color)
     fuzz_lenses(rng, depth, intrinsics, a_lens(rng, views))
+
+
+def fuzz_depth_filters(rng: np.random.Generator, depth: Tensor) -> None:
+    jump = float(rng.choice([1e-3, 0.02, 0.5, np.inf]))
+    sigmas = {"sigma_pixels": float(rng.choice([1e-9, 1.5, 1e9])), "sigma_depth": float(rng.choice([1e-9, 0.01, 1e9]))}
+    check("bilateral_filter", depth, reach=int(rng.integers(1, 8)), max_jump=jump, **sigmas)
+    check("median_filter", depth, reach=int(rng.integers(1, 4)), max_jump=None if rng.random() < 0.5 else jump)
+    alpha, delta = float(rng.choice([1e-3, 0.4, 1.0])), float(rng.choice([1e-3, 0.05, 1e3, np.inf]))
+    check("spatial_filter", depth, alpha=alpha, delta=delta, iterations=int(rng.integers(1, 4)))
+    rule, max_size = str(rng.choice(["left", "farthest", "nearest"])), int(rng.integers(-2, 5))
+    max_size = max_size if max_size > 0 else None
+    check("fill_holes", depth, rule=rule, max_size=max_size)
+    scale = torch.from_numpy(rng.uniform(0.1, 100, len(depth))).float() if rng.random() < 0.5 else None
+    last = depth + torch.from_numpy(rng.choice([-1.0, 0.0, 0.01], depth.shape)).float()
+    seen = torch.from_numpy(rng.integers(0, 256, depth.shape)).to(torch.uint8)
+    steps: dict[str, tuple[Any, ...]] = {
+        "reciprocals": (depth, torch.ones(len(depth))),
+        "smoothed_images": (depth, scale, alpha, delta, 1),
+        "temporal_step": (depth, scale, last.clamp(min=0), seen, alpha, delta, int(rng.integers(9))),
+        "without_flying_pixels": (depth, None if rng.random() < 0.5 else seen, 0.02, int(rng.integers(1, 9))),
+        "fill_rows": (depth, int(rng.integers(1, 9))),
+        "filled_images": (depth, rule, max_size, 2),
+    }
+    for name, given in steps.items():
+        ours, theirs = (body(*given) for body in both(name))
+        assert all_equal(ours, theirs), name
+    filled = F.fill_holes(depth)[0]
+    marks = [None if rng.random() < 0.5 else image for image in (seen % 4, seen > 99)]
+    ours, theirs = (body(depth, filled, *marks) for body in both("filled_confidence"))
+    assert all_equal(ours, theirs)
+
+
+def all_equal(ours: Any, theirs: Any) -> bool:
+    if ours is None or theirs is None:
+        return ours is theirs
+    if isinstance(ours, tuple):
+        return all(map(all_equal, ours, theirs))
+    return ours.dtype is theirs.dtype and torch.equal(ours, theirs)
 
 
 def fuzz_lenses(rng: np.random.Generator, depth: Tensor, intrinsics: Tensor, lens: Tensor | None) -> None:

@@ -191,6 +191,60 @@ PC_EXPORT int32_t pc_points_in_grippers(const pc_context* context, const float* 
                                         const double* axes, const double* origin, const double* lower,
                                         const double* upper, int64_t num_grasps, int64_t* hits, int64_t* held);
 
+// -- filters of depth images ------------------------------------------------------------------------------------------
+
+// values (views, pixels) -> scales (views,) divided by them; 0 stays 0.
+PC_EXPORT int32_t pc_reciprocals(const pc_context* context, const float* values, const float* scales, int64_t views,
+                                 int64_t pixels, float* reciprocals);
+
+// values (views, height, width), 0 = no reading -> smoothed of that shape: averages along rows, then columns, forth and
+// back, `iterations` times. A pixel adds `keep` of the difference from the average that arrives at it, but starts anew
+// where the neighbor has no reading or lies `delta` or more away. With scales (views,), else null, their reciprocals
+// are smoothed, and turned back.
+PC_EXPORT int32_t pc_spatial_filter(const pc_context* context, const float* values, const float* scales, int64_t views,
+                                    int64_t height, int64_t width, double keep, double delta, int64_t iterations,
+                                    float* smoothed);
+
+// values (views, pixels) and what is remembered: last (views, pixels) and history (views, pixels) -> filtered, and what
+// is remembered for the next frame. scales, keep and delta as above; pixels without a reading repeat the last one where
+// `needed` of the lowest `frames` bits of the history are set.
+PC_EXPORT int32_t pc_temporal_filter(const pc_context* context, const float* values, const float* scales, int64_t views,
+                                     int64_t pixels, double keep, double delta, int64_t needed, int64_t frames,
+                                     const float* last, const uint8_t* history, float* filtered, float* new_last,
+                                     uint8_t* new_history);
+
+// depth (views, height, width) -> smoothed of that shape: means of the readings of the windows of 2 reach + 1 pixels
+// that differ by at most max_jump times the nearer of the two, weighted by shares (window, window) and by 2 to the
+// power of rate times the squared difference.
+PC_EXPORT int32_t pc_bilateral_filter(const pc_context* context, const float* depth, int64_t views, int64_t height,
+                                      int64_t width, int64_t reach, const float* shares, double scale, double max_jump,
+                                      float* smoothed);
+
+// The same with the lower medians of those readings; of all of the window if max_jump is negative. reach is 1 to 3.
+PC_EXPORT int32_t pc_median_filter(const pc_context* context, const float* depth, int64_t views, int64_t height,
+                                   int64_t width, int64_t reach, double max_jump, float* found);
+
+// depth (views, height, width), fewer than 2^31 pixels -> filled of that shape: holes get the depth of a reading beside
+// them: by rule 0 the next one to the left; by 1 and 2 layer after layer from the rims the farthest and the nearest of
+// their four neighbors. With max_size, else 0, not where a square of max_size + 1 pixels that holds no reading fits
+// over them. Of that shape, and null if not wanted: distance, pixels to the reading, 0 = not filled; far, 0 or 1,
+// whether it is above the limit.
+PC_EXPORT int32_t pc_fill_holes(const pc_context* context, const float* depth, int64_t views, int64_t height,
+                                int64_t width, int64_t rule, int64_t max_size, float* filled, int64_t* distance,
+                                int64_t limit, uint8_t* far);
+
+// values (rows, width), 0 = no reading -> filled of that shape: up to `radius` pixels of every gap take the value to
+// their left, then as many of what is left of it the one to their right.
+PC_EXPORT int32_t pc_fill_rows(const pc_context* context, const float* values, int64_t rows, int64_t width,
+                               int64_t radius, float* filled);
+
+// Depths before and after holes were filled (count,), and the confidence before, or null -> that after, and whether any
+// pixel was filled: filled ones become 2, or 1 where far (count,) is set, which may be null; without confidence
+// readings have 3.
+PC_EXPORT int32_t pc_filled_confidence(const pc_context* context, const float* before, const float* after,
+                                       int64_t count, const uint8_t* confidence, const uint8_t* far,
+                                       uint8_t* filled_confidence, int64_t* any_filled);
+
 // -- points on depth images -------------------------------------------------------------------------------------------
 
 // depth (num_views, height, width), 0 = no reading -> flying (num_views, height, width), 0 or 1: whether a reading has
@@ -198,6 +252,12 @@ PC_EXPORT int32_t pc_points_in_grippers(const pc_context* context, const float* 
 // they differ by at most `tolerance` times the nearer.
 PC_EXPORT int32_t pc_flying_pixels(const pc_context* context, const float* depth, int64_t num_views, int64_t height,
                                    int64_t width, double tolerance, int64_t least, uint8_t* flying);
+
+// The same -> kept (num_views, height, width), without them; with confidence of that shape, else null, kept_confidence
+// that is 0 there.
+PC_EXPORT int32_t pc_without_flying_pixels(const pc_context* context, const float* depth, int64_t num_views,
+                                           int64_t height, int64_t width, double tolerance, int64_t least,
+                                           const uint8_t* confidence, float* kept, uint8_t* kept_confidence);
 
 // values (N,) of points on the pixels (N,), rising within each cloud, of images (height, width) -> medians (N,): the
 // lower medians of the values that the 3 x 3 pixels around each have; those that are NaN do not count.

@@ -115,6 +115,10 @@ inline FloatRegister square_root(FloatRegister a) {
 }
 #endif
 
+inline FloatRegister magnitude(const FloatRegister& value) {
+  return reinterpret_cast<FloatRegister>(reinterpret_cast<Int32Register>(value) & 0x7FFFFFFF);
+}
+
 // Squared length as every backend computes it: ((dx*dx)+(dy*dy))+(dz*dz), never fused.
 template <class T>
 inline T squared_length(const T& dx, const T& dy, const T& dz) {

@@ -3,8 +3,8 @@
 #include <limits>
 
 #include "pc/cells/union_find.hpp"
+#include "pc/images/padded_rows.hpp"
 #include "pc/memory.hpp"
-#include "pc/threads.hpp"
 
 namespace pc::windows {
 namespace {
@@ -13,24 +13,22 @@ constexpr int64_t kPiece = 1 << 13;  // points that a thread takes at once
 
 // -- flying pixels ------------------------------------------------------------------------------------------------
 
-constexpr int kColumns = 256;  // of a row at once
+constexpr int kColumns = 256;  // of a row at once; as many are looked at beyond the last one
 
-// Write which of `count` neighbors in a row, at most kColumns, fly; rows[r][i] is left of pixel i, row r - 1.
-void fly_in_run(const float* const* rows, int count, float tolerance, int32_t least, uint8_t* flying) {
-  alignas(64) int32_t on_surface[kColumns] = {}, at_edge[kColumns] = {};
-  const float* own = rows[1] + 1;
+// Say which of as many neighbors in a row as a register holds fly; rows[r][i] is left of pixel i, row r - 1.
+RegisterMask flying_pixels(const float* const* rows, const FloatRegister& tolerance, const Int32Register& least) {
+  const FloatRegister own = load<FloatRegister>(rows[1] + 1), zero{};
+  Int32Register on_surface{}, around{};  // how many of the eight lie there, and have a reading
+  const Int32Register one = Int32Register{} + 1;
   for (int r = 0; r < 3; ++r)
     for (int c = 0; c < 3; ++c) {
       if (r == 1 && c == 1) continue;
-      const float* other = rows[r] + c;
-      for (int i = 0; i < count; ++i) {
-        const float a = own[i], b = other[i], nearer = b < a ? b : a;
-        const int32_t both = nearer > 0, same = std::fabs(a - b) <= tolerance * nearer;
-        on_surface[i] += both & same;
-        at_edge[i] |= both & ~same;
-      }
+      const FloatRegister other = load<FloatRegister>(rows[r] + c), nearer = minimum(own, other), apart = own - other;
+      const RegisterMask both = less(zero, nearer), same = both & less_equal(magnitude(apart), tolerance * nearer);
+      around = select(both, around + one, around);
+      on_surface = select(same, on_surface + one, on_surface);
     }
-  for (int i = 0; i < count; ++i) flying[i] = static_cast<uint8_t>(at_edge[i] & (on_surface[i] < least));
+  return unequal(on_surface, around) & less(on_surface, least);
 }
 
 // -- medians of 3 x 3 pixels --------------------------------------------------------------------------------------
@@ -39,8 +37,8 @@ void fly_in_run(const float* const* rows, int count, float tolerance, int32_t le
 // Xcell 23, 1996.
 constexpr int kExchanges[19][2] = {{1, 2}, {4, 5}, {7, 8}, {0, 1}, {3, 4}, {6, 7}, {1, 2}, {4, 5}, {7, 8}, {0, 3},
                                    {5, 8}, {4, 7}, {3, 6}, {1, 4}, {2, 5}, {4, 7}, {4, 2}, {6, 4}, {4, 2}};
-constexpr int kRun = 64;    // neighbors in a row that are sorted side by side,
-constexpr int kLanes = 16;  // so many at a time
+constexpr int kRun = 64;     // neighbors in a row that are sorted side by side,
+constexpr int kAtOnce = 16;  // so many at a time
 
 // The lower median of those of nine values that are numbers.
 float median_of_some(const float* const* rows, int64_t at) {
@@ -58,7 +56,7 @@ float median_of_some(const float* const* rows, int64_t at) {
 void medians_of_run(const float* const* rows, int64_t count, float* medians) {
   for (int64_t first = 0; first < count; first += kRun) {
     const auto some = static_cast<int>(std::min<int64_t>(kRun, count - first));
-    const int whole = (some + kLanes - 1) / kLanes * kLanes;
+    const int whole = (some + kAtOnce - 1) / kAtOnce * kAtOnce;
     float values[9][kRun] = {};
     float sum[kRun] = {};  // NaN where a pixel has no point
     for (int r = 0; r < 3; ++r)
@@ -117,28 +115,44 @@ PC_EXPORT int32_t pc_flying_pixels(const pc_context* context, const float* depth
   using namespace pc;
   using namespace pc::windows;
   return guarded([&] {
-    const int64_t rows_at_once = std::max<int64_t>(1, (1 << 15) / std::max<int64_t>(width, 1));
-    parallel_for(*context, num_views * height, rows_at_once, [&](int64_t begin, int64_t end, int64_t) {
-      // Three rows with a pixel without a reading at both ends; above and below the image there is none either.
-      std::vector<float> padded(static_cast<size_t>(3 * (width + 2)), 0.0F);
-      for (int64_t row = begin; row < end; ++row) {
-        const float* rows[3];
-        for (int64_t r = 0; r < 3; ++r) {
-          float* to = padded.data() + (row + r) % 3 * (width + 2);
-          rows[r] = to;
-          if (r < 2 && row > begin && row % height != 0) continue;  // read for the row before
-          const int64_t v = row % height + r - 1;
-          if (v < 0 || v >= height)
-            std::fill_n(to + 1, width, 0.0F);
-          else
-            std::copy_n(depth + (row + r - 1) * width, width, to + 1);
-        }
-        for (int64_t u = 0; u < width; u += kColumns) {
+    const FloatRegister part = FloatRegister{} + static_cast<float>(tolerance);
+    const Int32Register wanted = Int32Register{} + static_cast<int32_t>(least);
+    images::for_rows(*context, depth, {num_views, height, width}, 1, [&](int64_t row, const float* const* rows) {
+      for (int64_t first = 0; first < width; first += kColumns) {
+        const int64_t last = std::min(first + kColumns, width);
+        alignas(64) int32_t found[kColumns];
+        for (int64_t u = first; u < last; u += kLanes) {
           const float* const some[3] = {rows[0] + u, rows[1] + u, rows[2] + u};
-          fly_in_run(some, static_cast<int>(std::min<int64_t>(kColumns, width - u)), static_cast<float>(tolerance),
-                     static_cast<int32_t>(least), flying + row * width + u);
+          const RegisterMask fly = flying_pixels(some, part, wanted);
+          store(found + (u - first), select(fly, Int32Register{} + 1, Int32Register{}));
         }
+        for (int64_t u = first; u < last; ++u) flying[row * width + u] = static_cast<uint8_t>(found[u - first]);
       }
+    });
+  });
+}
+
+PC_EXPORT int32_t pc_without_flying_pixels(const pc_context* context, const float* depth, int64_t num_views,
+                                           int64_t height, int64_t width, double tolerance, int64_t least,
+                                           const uint8_t* confidence, float* kept, uint8_t* kept_confidence) {
+  using namespace pc;
+  using namespace pc::windows;
+  return guarded([&] {
+    const FloatRegister part = FloatRegister{} + static_cast<float>(tolerance);
+    const Int32Register wanted = Int32Register{} + static_cast<int32_t>(least);
+    images::for_rows(*context, depth, {num_views, height, width}, 1, [&](int64_t row, const float* const* rows) {
+      float* to = kept + row * width;
+      for (int64_t u = 0; u < width; u += kLanes) {
+        const float* const some[3] = {rows[0] + u, rows[1] + u, rows[2] + u};
+        const FloatRegister own = load<FloatRegister>(rows[1] + u + 1);
+        const FloatRegister left = select(flying_pixels(some, part, wanted), FloatRegister{}, own);
+        std::memcpy(to + u, &left, static_cast<size_t>(std::min<int64_t>(kLanes, width - u)) * sizeof(float));
+      }
+      if (confidence == nullptr) return;
+      const float* own = rows[1] + 1;
+      const uint8_t* was = confidence + row * width;
+      uint8_t* now = kept_confidence + row * width;
+      for (int64_t u = 0; u < width; ++u) now[u] = own[u] > 0 && to[u] == 0 ? uint8_t{0} : was[u];
     });
   });
 }
