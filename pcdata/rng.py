@@ -112,7 +112,8 @@ class Streams:
                 "generator must be on the CPU, where decisions are drawn for every device: use torch.Generator()"
             )
         if isinstance(generator, Generator):
-            return cls([child_seed(generator) for _ in range(num_clouds)])
+            # All at once: the numbers that child_seed draws one by one.
+            return cls(torch.randint(0, 2**62, (num_clouds,), generator=generator, device="cpu").numpy())
         if len(given) != num_clouds:
             raise ShapeError(f"generator: {len(given)} generators were given for {num_clouds} clouds")
         keys = {one: child_seed(one) for one in dict.fromkeys(given)}

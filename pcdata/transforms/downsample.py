@@ -11,7 +11,7 @@ from annotated_types import Ge
 from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
-from pcdata.functional.rows import group_first, ptr_after_mask, ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, group_first, ptr_after_mask, ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample, random_sample_index
 from pcdata.functional.voxels import find_voxel_size, voxel_downsample, voxel_nearest
 from pcdata.rng import Streams, seeded
@@ -121,8 +121,8 @@ class _Sample(SelectTransform, abstract=True):
         """The wanted count of every cloud."""
         return [self.num_points] * cloud.num_clouds
 
-    def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> list[Tensor]:
-        """For every cloud, ``counts[b]`` of its rows in sampling order; it has at least so many."""
+    def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> Tensor:
+        """Of every cloud, one after another, ``counts[b]`` rows in sampling order; it has at least so many."""
         raise NotImplementedError
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
@@ -136,9 +136,11 @@ class _Sample(SelectTransform, abstract=True):
                     f"{want} asked; ask for fewer (num_points)" + ("" if have == 0 else ", or choose if_short")
                 )
         seeds = streams.seeds().tolist() if self.is_random else [0] * cloud.num_clouds
-        sampled = self.sample(cloud, [min(pair) for pair in zip(wanted, available, strict=True)], seeds)
-        filled = [self._fill_up(*case) for case in zip(sampled, wanted, seeds, strict=True)]
-        return torch.cat(filled), ptr_from_counts([len(rows) for rows in filled], device=cloud.device)
+        counts = [min(pair) for pair in zip(wanted, available, strict=True)]
+        rows = self.sample(cloud, counts, seeds)
+        if counts == wanted or self.if_short == "keep":
+            return rows, ptr_from_counts(counts, device=cloud.device)
+        return self._fill_up(rows, counts, wanted, seeds), ptr_from_counts(wanted, device=cloud.device)
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Select the rows and blank those marked -1."""
@@ -150,17 +152,26 @@ class _Sample(SelectTransform, abstract=True):
         filler = fillers(fields, chosen.kinds)
         return chosen.with_fields(**{name: _blanked(value, blank, filler[name]) for name, value in fields.items()})
 
-    def _fill_up(self, rows: Tensor, wanted: int, seed: int) -> Tensor:
-        missing = wanted - len(rows)
-        if missing <= 0 or self.if_short == "keep":
-            return rows
-        if self.if_short == "zeros":
-            return torch.cat([rows, rows.new_full((missing,), -1)])
+    def _fill_up(self, rows: Tensor, counts: list[int], wanted: list[int], seeds: list[int]) -> Tensor:
+        """Lengthen the ``counts`` rows of every cloud to as many as are wanted."""
+        have, ptr = torch.tensor(counts, dtype=torch.int64, device="cpu"), ptr_from_counts(wanted)
+        cloud = cloud_of_rows(ptr)
+        place = torch.arange(len(cloud), dtype=torch.int64, device="cpu") - ptr[cloud]
+        missing = place >= have[cloud]
         if self.if_short == "repeat" and self.is_random:
-            # Another stream than the one that drew the sample itself.
-            duplicates = torch.randint(len(rows), (missing,), generator=seeded(seed ^ 1), device="cpu")
-            return torch.cat([rows, rows[duplicates.to(rows.device)]])
-        return rows.repeat(-(-wanted // len(rows)))[:wanted]
+            # Other streams than those that drew the samples themselves.
+            short = [case for case in zip(counts, wanted, seeds, strict=True) if case[0] < case[1]]
+            drawn = [
+                torch.randint(count, (want - count,), generator=seeded(seed ^ 1), device="cpu")
+                for count, want, seed in short
+            ]
+            place[missing] = torch.cat(drawn)
+        elif self.if_short != "zeros":
+            place %= have[cloud]
+        source = ptr_from_counts(counts)[cloud] + place
+        if self.if_short == "zeros":
+            source[missing] = len(rows)
+        return torch.cat([rows, rows.new_tensor([-1])])[source.to(rows.device)]
 
 
 class _FarthestPoints(_Sample, abstract=True):
@@ -184,7 +195,7 @@ class _FarthestPoints(_Sample, abstract=True):
         """Where each cloud begins, as farthest_point_sample takes it."""
         raise NotImplementedError
 
-    def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> list[Tensor]:
+    def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> Tensor:
         """Sample all clouds in one call."""
         name = type(self).__name__
         if self.color_weight and cloud.colors is None:
@@ -197,8 +208,7 @@ class _FarthestPoints(_Sample, abstract=True):
         asked = torch.tensor(counts, dtype=torch.int64, device=cloud.device)
         given = self.starts(cloud, seeds)
         labels = cloud.labels if self.balance_labels else None
-        index, ptr = farthest_point_sample(features, cloud.ptr, num_samples=asked, labels=labels, **given)
-        return list(torch.tensor_split(index, ptr[1:-1].cpu()))
+        return farthest_point_sample(features, cloud.ptr, num_samples=asked, labels=labels, **given)[0]
 
 
 class FarthestPointSample(_FarthestPoints):
@@ -250,9 +260,9 @@ class RandomSample(_Sample):
             return super().pick(cloud, streams)
         wanted = self.wanted_counts(cloud, streams)
         rows = self.sample(cloud, wanted, streams.seeds().tolist())
-        return torch.cat(rows), ptr_from_counts(wanted, device=cloud.device)
+        return rows, ptr_from_counts(wanted, device=cloud.device)
 
-    def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> list[Tensor]:
+    def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> Tensor:
         """Take the head of a random permutation of each cloud, or draw each row anew."""
         rows = []
         for start, have, count, seed in zip(cloud.ptr.tolist(), cloud.counts.tolist(), counts, seeds, strict=False):
@@ -260,8 +270,8 @@ class RandomSample(_Sample):
                 drawn = torch.randint(have, (count,), generator=seeded(seed), device="cpu")
             else:
                 drawn = torch.randperm(have, generator=seeded(seed), device="cpu")[:count]
-            rows.append(start + drawn.to(cloud.device))
-        return rows
+            rows.append(drawn.add_(start))
+        return torch.cat(rows).to(cloud.device)
 
 
 class RandomShuffle(SelectTransform):

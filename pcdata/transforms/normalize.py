@@ -7,7 +7,7 @@ from typing import Literal
 import torch
 
 from pcdata.errors import ConfigError, TooFewPointsError
-from pcdata.functional.rows import cloud_of_rows, segment_max, segment_mean
+from pcdata.functional.rows import cloud_of_rows, segment_max, segment_mean, segment_min
 from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import NORMALIZED, PointCloud
@@ -113,10 +113,9 @@ class ShiftToOrigin(SpatialTransform):
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Measure the box of every cloud."""
-        parts = torch.tensor_split(data.points.double(), data.ptr[1:-1].cpu())
-        zero = data.points.new_zeros(3, dtype=torch.float64)
-        lower = torch.stack([part.amin(dim=0) if len(part) else zero for part in parts])
-        upper = torch.stack([part.amax(dim=0) if len(part) else zero for part in parts])
+        lower, upper = (reduce(data.points, data.ptr).double() for reduce in (segment_min, segment_max))
+        empty = (data.counts == 0)[:, None]
+        lower, upper = lower.masked_fill(empty, 0.0), upper.masked_fill(empty, 0.0)
         origin = lower.clone()
         if self.anchor == "floor":
             origin[:, :2] = (lower + upper)[:, :2] / 2
