@@ -29,6 +29,7 @@ from timing import RESULTS, in_turn, spread
 import pcdata
 from pcdata import functional as F
 from pcdata.geometry import rigid
+from pcdata.live import LiveTemporalFilter
 from pcdata.report import text_table
 from pcdata.structures import Camera, DepthFrame
 from pcdata.synthetic import tabletop
@@ -131,6 +132,16 @@ def cases(frame: DepthFrame) -> Iterator[Case]:
         "spatial filter, 2 iterations", lambda: F.spatial_filter(disparity), "bilateralFilter 5 x 5",
         lambda: cv2.bilateralFilter(disparity[0].numpy(), 5, 20.0, 3.0), "a smaller window, holes blend in",
     )  # fmt: skip
+    for reach in (1, 2):
+        side = 2 * reach + 1
+        yield Case(
+            f"median filter {side} x {side}", lambda reach=reach: F.median_filter(depth, reach=reach),
+            f"medianBlur {side} x {side}", lambda side=side: cv2.medianBlur(image, side), "holes count as 0",
+        )  # fmt: skip
+    yield Case(
+        "bilateral filter 5 x 5", lambda: F.bilateral_filter(depth), "bilateralFilter 5 x 5",
+        lambda: cv2.bilateralFilter(image, 5, 0.01, 1.5), "a round window, a table of weights, holes blend in",
+    )  # fmt: skip
     _, state = F.temporal_filter(disparity)
     average = disparity[0].numpy().copy()
     yield Case(
@@ -146,7 +157,31 @@ def cases(frame: DepthFrame) -> Iterator[Case]:
         "flying pixels", lambda: F.flying_pixel_mask(depth), "medianBlur 3 x 3 and compare",
         lambda: np.abs(cv2.medianBlur(image, 3) - image) > 0.02 * image, "another rule",
     )  # fmt: skip
+    for size in (SIZE, (480, 640)):
+        yield chain_case(frame if size == SIZE else pcdata.ResizeDepth(size=size)(frame))
     yield from registration_cases(frame)
+
+
+def chain_case(frame: DepthFrame) -> Case:
+    """Return flying pixels, spatial and temporal filter and holes, one after another, as a live stream has them."""
+    steps = pcdata.RemoveFlyingPixels(), pcdata.SpatialFilterDepth(), LiveTemporalFilter(), pcdata.FillHoles()
+    image = frame.depth[0].numpy()
+    holes, average = (image == 0).astype(np.uint8), image.copy()
+
+    def ours() -> DepthFrame:
+        filtered = frame
+        for step in steps:
+            filtered = step(filtered)
+        return filtered
+
+    def theirs() -> Any:
+        smooth = cv2.bilateralFilter(cv2.medianBlur(image, 3), 5, 0.01, 1.5)
+        cv2.accumulateWeighted(smooth, average, 0.4)
+        return cv2.inpaint(average, holes, 3, cv2.INPAINT_NS)
+
+    name = f"the chain of four at {image.shape[1]}x{image.shape[0]}"
+    peer = "medianBlur, bilateralFilter, accumulateWeighted, inpaint"
+    return Case(name, ours, peer, theirs, "other filters of the same kinds")
 
 
 def registration_cases(frame: DepthFrame) -> Iterator[Case]:
