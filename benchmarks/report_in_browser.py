@@ -67,7 +67,13 @@ def measure(page: str, many: str) -> dict[str, Any]:
             tab.close()
         tab = visited(opened, many, viewport={"width": 1200, "height": 900})
         count = tab.evaluate("window.pcdata.said.count")
-        rates = [tab.evaluate("window.pcdata.stage.measure(30)") for _ in range(3)]
+        rates = {
+            all_points: statistics.median(
+                tab.evaluate(f"window.pcdata.stage.measure(30, {all_points})") for _ in range(3)
+            )
+            for all_points in ("true", "false")
+        }
+        while_turning = tab.evaluate("Math.ceil(window.pcdata.said.count / window.pcdata.stage.step)")
         renderer = tab.evaluate("window.pcdata.stage.rendererName")
     return {
         "page_mb": round(Path(page).stat().st_size / 1e6, 2),
@@ -76,8 +82,10 @@ def measure(page: str, many: str) -> dict[str, Any]:
             "all": [round(one, 2) for one in paints],
         },
         "view_drawn_seconds": round(statistics.median(views), 2),
-        "points_turned": count,
-        "frames_per_second": round(statistics.median(rates), 1),
+        "points": count,
+        "frames_per_second": round(rates["true"], 1),
+        "points_while_turning": while_turning,
+        "frames_per_second_while_turning": round(rates["false"], 1),
         "renderer": renderer,
         "load": round(os.getloadavg()[0], 1),
     }

@@ -51,6 +51,13 @@ class Finding:
         return finite_json({**vars(self), "verdict": self.verdict.value})
 
 
+def in_figures(value: float) -> str:
+    """Write a number as a reader does: four figures of small ones, large ones whole with commas, no exponent."""
+    if abs(value) >= 1000:
+        return f"{value:,.0f}"
+    return f"{value:.4g}" if abs(value) >= 1e-4 else f"{value:.7f}".rstrip("0").rstrip(".")
+
+
 def judged(value: float, passes: float, fails: float | None, *, at_least: bool = False) -> Verdict:
     """Judge a number: it passes up to the first limit, warns beyond it and fails beyond the second (None = never).
 

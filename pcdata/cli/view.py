@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 from pathlib import Path
 from typing import Any
 
+from pcdata.cli import signals
 from pcdata.cli.argument_types import port, positive
 from pcdata.cli.options import add_capture_options, open_captures
 from pcdata.cli.progress_bar import ProgressBar
@@ -33,6 +35,7 @@ def add_to(commands: Any) -> None:
 def _view(arguments: argparse.Namespace) -> int:
     from pcdata.build import load_config
     from pcdata.datasets.stored_clouds import StoredClouds
+    from pcdata.report.html.gathering import title_of
     from pcdata.report.serving.samples import Samples
     from pcdata.report.serving.server import ViewServer
 
@@ -50,7 +53,7 @@ def _view(arguments: argparse.Namespace) -> int:
     pipeline = None if arguments.config is None else load_config(arguments.config).pipeline
     if arguments.rerun:
         return _rerun(arguments, source, pipeline)
-    with ViewServer(Samples(source, pipeline), title=str(source), port=arguments.port) as server:
+    with ViewServer(Samples(source, pipeline), title=title_of(source), port=arguments.port) as server:
         print(f"showing  {source}")
         print(f"address  {server.address}")
         print("Ctrl-C ends it; who works on another machine forwards the port: ", end="")
@@ -59,6 +62,8 @@ def _view(arguments: argparse.Namespace) -> int:
         try:
             server.serve_forever(poll_interval=0.2)
         except KeyboardInterrupt:
+            if signals.current.first not in (None, signal.SIGINT):
+                raise  # ended by somebody else: the exit code says so
             print("ended")
     return 0
 

@@ -7,9 +7,10 @@ from pathlib import Path
 from pcdata.datasets.cached import CachedCloudDataset
 from pcdata.errors import CaptureError
 from pcdata.structures import Episode, PointCloud
+from pcdata.structures.captures import Captures
 
 
-class StoredClouds:
+class StoredClouds(Captures):
     """The clouds that ``pcdata build`` stored, by their ids, without the random rest of the pipeline.
 
     Args:

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from pcdata.errors import ConfigError
 from pcdata.files.sample_names import check_known
 from pcdata.structures import DepthFrame
+from pcdata.structures.captures import Captures
 from pcdata.synthetic.stereo_camera import SensorNoise, noise_named
 from pcdata.synthetic.tabletop import Tabletop, tabletop
 from pcdata.synthetic.viewpoints import Miscalibration
 
 
 @dataclass(frozen=True, kw_only=True)
-class SyntheticSource:
+class SyntheticSource(Captures):
     """``num_scenes`` tabletop captures; scene i is ``tabletop(seed + i, ...)``, rendered when it is loaded.
 
     Holds only these numbers, so it pickles to any worker and loads the same bytes there.

@@ -18,6 +18,7 @@ from pcdata.files.sample_names import check_known
 from pcdata.geometry import rigid
 from pcdata.rng import generator_for
 from pcdata.structures import DepthFrame, Episode, Signal
+from pcdata.structures.captures import Captures
 from pcdata.synthetic.scene import make_table
 from pcdata.synthetic.shapes import Box, Cylinder, Shape
 from pcdata.synthetic.tabletop import BASE_FRAME, rendered
@@ -138,7 +139,7 @@ class TeleopState:
 
 
 @dataclass(frozen=True, kw_only=True)
-class TeleopSource:
+class TeleopSource(Captures):
     """``num_episodes`` demonstrations of one task as captures with signals; each is rendered when it is loaded.
 
     Samples are called ``NAME-EPISODE-STEP``. Every step has the signals joints (5, radians), gripper (1 = open), hand

@@ -31,6 +31,12 @@ class DepthUnit(NamedTuple):
         order = "" if self.encoding == "plain" else f", depth_encoding={self.encoding}"
         return f"metres_per_unit={self.metres:.10g}{order}"
 
+    @property
+    def flags(self) -> str:
+        """The options of the command line that say so."""
+        order = "" if self.encoding == "plain" else f" --depth-encoding {self.encoding}"
+        return f"--metres-per-unit {self.metres:.10g}{order}"
+
 
 class UnitFit(NamedTuple):
     """One unit that stored depth may be in."""

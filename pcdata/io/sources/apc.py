@@ -97,7 +97,7 @@ class _ApcSource(ListedSource):
         motion = matrix_of(f"{info}: {_MOTION}", blocks[_MOTION]) if _MOTION in blocks else None
         if color_from_depth is not None:
             motion = check_motion(where, "color_from_depth", color_from_depth)
-        facts: dict[str, Any] = {"metres_per_unit": _UNIT, "depth_encoding": "rotated"}
+        facts: dict[str, Any] = {"metres_per_unit": _UNIT, "depth_encoding": "rotated", "unit_is_recorded": True}
         if motion is None and poses:
             facts |= {"missing": [_MISSING]} if own else {"not_needed": [_NOT_NEEDED]}
         if not own:

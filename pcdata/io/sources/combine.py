@@ -19,12 +19,13 @@ from pcdata.io.sources.capture_source import (
     unread_of,
 )
 from pcdata.structures import DepthFrame, Episode, PointCloud, Signal
+from pcdata.structures.captures import Captures
 from pcdata.structures.episodes import kept_episodes
 
 Part = TypeVar("Part")
 
 
-class Selectable(ABC, Generic[Part]):
+class Selectable(Captures, ABC, Generic[Part]):
     """A source of which a part can be taken, as :func:`open_source` returns it."""
 
     kind: ClassVar[str]  # of which layout or combinator it is

@@ -28,6 +28,7 @@ from pcdata.report.html.panels.cameras import PLANES, series_of
 from pcdata.report.html.panels.numbers import OWN_PANELS
 from pcdata.report.html.panels.over_time import is_over_time
 from pcdata.validation.by_camera import CameraHistory, cameras_of
+from pcdata.verdicts import in_figures
 
 WIDTH = 15.6  # inches of every figure
 _COLUMNS = 4
@@ -106,7 +107,7 @@ def planes_figure(gathered: Gathered) -> Any | None:
     panels: list[Panel] = []
     for name, heading, unit, factor in PLANES:
         series = {view: factor * values for view, values in series_of(gathered.grading, name).items()}
-        named = {f"median {np.nanmedian(values):.4g}, {view}": values for view, values in series.items()}
+        named = {f"median {in_figures(float(np.nanmedian(values)))}, {view}": values for view, values in series.items()}
         if named:
             panels.append(partial(curves_panel, title=f"{heading} [{unit}]", series=named))
     if not panels:

@@ -43,12 +43,12 @@ def bands_panel(axis: Any, title: str, bands: Sequence[Band], ends: tuple[str, s
     from matplotlib.colors import to_rgba
 
     colors = np.array([*map(to_rgba, VERDICT_COLORS), _NONE])  # -1 is the last
-    axis.set_title(label_text(title), fontsize=9)
+    axis.set_title(label_text(title), fontsize=12)
     for row, band in enumerate(bands):
         image = colors[worst_of_columns(band.severities, _COLUMNS)][None]
         axis.imshow(image, extent=(0, 1, row + 0.4, row), aspect="auto", interpolation="nearest")
-        told = label_text(_short(f"{_short(band.name, 36)}  {band.told}", 96))
-        axis.text(0, row - 0.1, told, va="bottom", fontsize=7).set_in_layout(False)
+        told = label_text(_short(f"{_short(band.name, 30)}  {band.told}", 76))
+        axis.text(0, row - 0.08, told, va="bottom", fontsize=10).set_in_layout(False)
         across = [place / max(len(band.severities), 1) for place in band.gaps]
         if across:
             axis.plot(across, [row - 0.05] * len(across), "v", color="black", markersize=4)
@@ -58,12 +58,12 @@ def bands_panel(axis: Any, title: str, bands: Sequence[Band], ends: tuple[str, s
         axis.plot([], [], "v", color="black", markersize=4, label="captures are missing")
     for end, edge, side in zip(ends or (), (0, 1), ("left", "right")):
         told = label_text(_short(end, 24))
-        axis.text(edge, len(bands) - 0.55, told, ha=side, va="top", fontsize=7).set_in_layout(False)
+        axis.text(edge, len(bands) - 0.55, told, ha=side, va="top", fontsize=9).set_in_layout(False)
     axis.set_xlim(0, 1)
     axis.set_ylim(max(len(bands), 3) + 0.3, -0.6)
     axis.set_axis_off()
     axis.legend(
-        loc="lower left", ncols=5, fontsize=6, frameon=False, borderaxespad=0, handletextpad=0.2, columnspacing=1
+        loc="lower left", ncols=5, fontsize=9, frameon=False, borderaxespad=0, handletextpad=0.2, columnspacing=1
     ).set_in_layout(False)
 
 

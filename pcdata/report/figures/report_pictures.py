@@ -32,9 +32,9 @@ from pcdata.report.labels import label_text
 from pcdata.validation.grading import Grading
 
 _COLUMNS = 4
-_LETTERS_PER_INCH = 15.4  # of a reason
-_LINE = 0.17  # inches of a reason
-_HEAD = 0.9  # inches above the reasons
+_LETTERS_PER_INCH = 11.2  # of a reason
+_LINE = 0.235  # inches of a reason
+_HEAD = 1.0  # inches above the reasons
 _MOST_LETTERS = 400  # of one reason
 _MOST_REASONS = 10
 _MOST_PANELS = 16  # of one sample
@@ -141,11 +141,11 @@ def _verdict_panel(axis: Any, grading: Grading, reasons: Sequence[str], size: tu
     letter = grading.grade().letter
     height, width = size
     axis.set_axis_off()
-    head = "\n".join(textwrap.wrap(grading.standing(), int(0.6 * _LETTERS_PER_INCH * width)))
+    head = "\n".join(textwrap.wrap(grading.standing(), int(0.55 * _LETTERS_PER_INCH * width)))
     drawn = [
         axis.text(0, 1, letter, fontsize=40, fontweight="bold", color=_LETTER_COLORS[letter], va="top"),
-        axis.text(0.7 / width, 0.98, head, va="top", fontsize=9),
-        axis.text(0, 1 - _HEAD / height, "\n".join(reasons), va="top", fontsize=8, linespacing=1.4),
+        axis.text(0.7 / width, 0.98, head, va="top", fontsize=14),
+        axis.text(0, 1 - _HEAD / height, "\n".join(reasons), va="top", fontsize=11, linespacing=1.4),
     ]
     for text in drawn:
         text.set_in_layout(False)  # long words would leave the panels beside it no room

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.report.html.text import shown
+from pcdata.verdicts import in_figures
 
 VERDICT_COLORS = ("#3ca951", "#9498a0", "#efb118", "#e5484d")  # pass, unknown, warn, fail
 _SERIES_COLORS = ("#4269d0", "#efb118", "#ff725c", "#3ca951", "#a463f2", "#6cc5b0", "#ff8ab7", "#9c6b4e")
@@ -31,8 +32,8 @@ def histogram(values: NDArray[np.floating], unit: str, *, bins: int = 40, width:
     if not len(finite):
         return '<p class="dim">no numbers</p>'
     counts, edges = np.histogram(finite, bins=bins)
-    ends = f'<text x="0" y="{height - 4}">{edges[0]:.3g} {shown(unit)}</text>' + (
-        f'<text x="{width}" y="{height - 4}" text-anchor="end">{edges[-1]:.3g} {shown(unit)}</text>'
+    ends = f'<text x="0" y="{height - 4}">{in_figures(edges[0])} {shown(unit)}</text>' + (
+        f'<text x="{width}" y="{height - 4}" text-anchor="end">{in_figures(edges[-1])} {shown(unit)}</text>'
     )
     return _svg(width, height, _columns(counts, width, height - 20) + ends)
 
@@ -145,7 +146,7 @@ def curves(
         down = height - 4 - (height - 8) * (values[places] - low) / span
         drawn.append(_curve(across, down, color))
         legend.append(f'<span><i style="background:{color}"></i>{shown(name, 80)}</span>')
-    told = f"<span>{low:.4g} to {high:.4g} {shown(unit)}</span>"
+    told = f"<span>{in_figures(low)} to {in_figures(high)} {shown(unit)}</span>"
     named = "".join(legend) if len(series) > 1 else ""
     return f'{_stretched(width, height, "".join(drawn))}<p class="legend">{told}{named}</p>'
 

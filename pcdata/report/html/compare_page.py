@@ -84,7 +84,7 @@ def _by_distance(result: Comparison) -> list[Section]:
 def _table(result: Comparison) -> str:
     rows = "".join(map(_row, sorted(result.measured, key=lambda one: -one.verdict.severity)))
     return (
-        "<table><tr><th>number</th><th>A</th><th>B</th><th>passes up to</th><th>would be seen from</th>"
+        "<table><tr><th>number</th><th>A</th><th>B</th><th>passes up to</th><th>smallest that would show</th>"
         f"<th>verdict</th><th>after the steps</th></tr>{rows}</table>"
         "<p class='dim'>A and B: means of the middle 60 % of the captures. A difference is one where it is larger than "
         "what passes, and more than captures of one source differ by.</p>"

@@ -24,7 +24,7 @@ def dataset_page(
     Args:
         folder: what ``pcdata build`` wrote.
         num_shown: samples with their clouds.
-        title: of the page; "" = the dataset's own text.
+        title: of the page; "" = its name.
         progress: told (samples judged, all, which).
 
     Raises:
@@ -42,7 +42,7 @@ def gather_dataset(
     return gather_captures(
         stored,
         num_shown=num_shown,
-        title=title or str(stored),
+        title=title,
         progress=progress,
         known=_known(stored.manifest),
     )

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from pcdata.datasets.stored_clouds import StoredClouds
 from pcdata.errors import PcdataError
-from pcdata.io.sources.capture_source import CaptureSource, episodes_of
+from pcdata.io.sources.capture_source import CaptureSource, episodes_of, unread_of
 from pcdata.report.html.episode_lines import EpisodeLine, episode_lines
 from pcdata.report.html.overlaps import overlap_of
 from pcdata.report.html.pictures import WIDTH, color_picture, confidence_picture, depth_picture, edges_picture
@@ -101,6 +102,7 @@ class Gathered:
         left_out: captures that are not in the dataset, and why.
         pipeline: the steps as YAML, "" = none.
         lines: some episodes over time, the worst first; a recording without episodes as one.
+        unread: what lies beside the captures and is not read, in words.
     """
 
     title: str
@@ -111,6 +113,7 @@ class Gathered:
     left_out: Mapping[str, str]
     pipeline: str
     lines: tuple[EpisodeLine, ...]
+    unread: tuple[str, ...] = ()
 
 
 def gather_captures(
@@ -132,7 +135,7 @@ def gather_captures(
         pipeline: steps to be shown too; its random ones are left out. None = the cloud that each capture shows.
         limits: of the checks; None = the defaults, for a camera above a table.
         num_shown: captures with pictures and clouds.
-        title: of the page; "" = what the source says of itself.
+        title: of the page; "" = its name, and how many there are.
         progress: told (captures judged, all, which).
         known: what is known of a dataset besides its clouds.
 
@@ -162,7 +165,7 @@ def gather_captures(
         )
     )
     return Gathered(
-        title=title or str(source),
+        title=title or title_of(source),
         source=str(source),
         grading=grading,
         looked=looked,
@@ -170,7 +173,15 @@ def gather_captures(
         left_out=known.left_out,
         pipeline=known.pipeline or (pipeline.to_yaml() if pipeline else ""),
         lines=episode_lines(source, grading),
+        unread=tuple(unread_of(source)),
     )
+
+
+def title_of(source: CaptureSource) -> str:
+    """Return what a page calls captures: their name, and how many there are."""
+    count = len(source.ids)
+    name, what = (source.folder.name, "sample") if isinstance(source, StoredClouds) else (source.name, "capture")
+    return f"{name}: {count:,} {what}{'s' * (count != 1)}"
 
 
 def _places_shown(worst: list[tuple[int, int]], total: int, num_shown: int) -> list[int]:

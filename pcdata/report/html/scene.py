@@ -20,6 +20,8 @@ MOST_POINTS = 200_000  # of one cloud: what a laptop's graphics turn without a s
 # Corners of a box, low before high along each axis, and the pairs of them that an edge joins.
 _CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=np.float64)
 _EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if (_CORNERS[a] != _CORNERS[b]).sum() == 1]
+_LEAST_NEAR = 0.1  # of the points on either side of a gap
+_TWO_CLASSES = 0.8  # of the variance that two classes explain: 0.75 of points spread evenly
 _AXES = {"x": "#e5484d", "y": "#30a46c", "z": "#3e63dd"}
 
 
@@ -113,13 +115,37 @@ def _bounds(cloud: PointCloud) -> tuple[NDArray[np.float64], NDArray[np.float64]
     points = cloud.points.detach().cpu()
     if not len(points):
         return -np.ones(3), np.ones(3)
-    some = points[:: max(1, len(points) // 20_000)].double().numpy()
+    stride = max(1, len(points) // 20_000)
+    some = points[::stride].double().numpy()
+    if (seen_from := cloud.viewpoint_per_point()) is not None:
+        some = some[_foreground(np.linalg.norm(some - seen_from[::stride].detach().cpu().double().numpy(), axis=1))]
     low, high = np.quantile(some, [0.1, 0.9], axis=0)
     low, high = low - 0.25 * (high - low), high + 0.25 * (high - low)
     all_low, all_high = (end.double().numpy() for end in points.aminmax(dim=0))
     low, high = np.maximum(low, all_low), np.minimum(high, all_high)
     reaches_farther = np.linalg.norm(all_high - all_low) > 1.5 * np.linalg.norm(high - low)
     return (low, high) if reaches_farther else (all_low, all_high)
+
+
+def _foreground(distance: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return what is near, where the distances from the cameras fall into near and far; else all.
+
+    Source: Otsu, A threshold selection method from gray-level histograms, IEEE Trans. SMC 9(1), 1979.
+    """
+    everything = np.ones(len(distance), dtype=bool)
+    logs = np.log(np.maximum(distance, 1e-9))
+    counts, edges = np.histogram(logs, bins=64)
+    share = counts.cumsum() / len(logs)
+    middles = (edges[1:] + edges[:-1]) / 2
+    total = float((counts * middles).sum() / len(logs))
+    below = (counts * middles).cumsum() / len(logs)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        between = (total * share - below) ** 2 / (share * (1 - share))
+    between[(share < _LEAST_NEAR) | (share > 1 - _LEAST_NEAR)] = 0.0
+    place = int(between.argmax())
+    if between[place] <= _TWO_CLASSES * logs.var():
+        return everything
+    return np.asarray(logs <= edges[place + 1])
 
 
 def _is_camera(cloud: PointCloud) -> bool:

@@ -13,6 +13,12 @@ from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.validation.measures.missing_region import largest_missing_block, largest_missing_region
 from pcdata.verdicts import Finding, graded
 
+_RAISE = (
+    "raise the exposure or the projector's power, turn away from windows and mirrors, keep to the sensor's range, or "
+    "drop the capture"
+)
+_ONE_PIECE = "one region explains it: right where the background was cut away on purpose; else "
+
 
 @register_check(
     "Is there depth at all, and where is it missing?",
@@ -85,8 +91,7 @@ def _coverage_of(
             limits=limits.valid_fraction,
             at_least=True,
             found=f"{count:,} of {valid.numel():,} pixels have a reading",
-            advice="raise the exposure or the projector's power, turn away from windows and mirrors, keep to the "
-            "sensor's range, or drop the capture",
+            advice=_ONE_PIECE + _RAISE if fraction + missing >= limits.valid_fraction[0] else _RAISE,
             view=view,
         ),
         graded(

@@ -48,8 +48,9 @@ def depth_unit_check(
         workspace_is_known=limits.workspace_is_stated,
         known_units=[unit.metres] if facts.get("unit_is_recorded") and is_known else limits.units,
     )
-    probability = sum(fit.probability for fit in fits if abs(fit.median / median - 1) < _SAME)
-    others = [fit for fit in fits if fit.probability >= _NAMED and abs(fit.median / median - 1) >= _SAME]
+    own_median = next((fit.median for fit in fits if fit.unit == unit), median)
+    probability = sum(fit.probability for fit in fits if abs(fit.median / own_median - 1) < _SAME)
+    others = [fit for fit in fits if fit.probability >= _NAMED and abs(fit.median / own_median - 1) >= _SAME]
     own = [UnitFit(unit, probability, median)] if probability >= _REFUTED else []
     found = f"half of the readings lie within {median:.3g} m; the workspace is {near:g} to {far:g} m"
     if probability < _REFUTED and others:
@@ -65,9 +66,9 @@ def depth_unit_check(
         )
     elif beyond > 2:
         verdict = Verdict.WARN
-        advice = "no other usual unit fits better: if the scene is that far away, say so with workspace"
+        advice = "no other usual unit fits better: if the scene is that far away, say so with --workspace NEAR FAR"
         if median < near:
-            advice = "no other usual unit fits better: if the scene is that near, say so with workspace"
+            advice = "no other usual unit fits better: if the scene is that near, say so with --workspace NEAR FAR"
     else:
         verdict, advice = Verdict.PASS, ""
     return Finding(
@@ -113,7 +114,8 @@ def _whole(metres: NDArray[np.float64], unit: float) -> NDArray[np.uint16] | Non
 def _mend(others: Sequence[UnitFit], unit: DepthUnit, is_known: bool) -> str:
     """Say what to change; options where the unit came with the file, factors where the depth was made in memory."""
     if is_known:
-        return f"set {units_in_words(others)}"
+        told = " or ".join(f"{fit.unit.flags} (half within {fit.median:.3g} m)" for fit in others)
+        return f"read them with {told}, in Python metres_per_unit= and depth_encoding="
     factors = (
         f"{fit.unit.metres / unit.metres:.6g} (half within {fit.median:.3g} m)"
         if fit.unit.encoding == "plain"
@@ -125,5 +127,5 @@ def _mend(others: Sequence[UnitFit], unit: DepthUnit, is_known: bool) -> str:
 
 def _doubt(others: Sequence[UnitFit]) -> str:
     if len(others) < 2:
-        return "; if a measured distance says otherwise, give workspace around it"
-    return "; several fit: measure a distance in the scene to choose, and give workspace around it"
+        return "; if a measured distance says otherwise, give --workspace NEAR FAR around it"
+    return "; several fit: measure a distance in the scene to choose, and give --workspace NEAR FAR around it"

@@ -110,7 +110,8 @@ def _range(readings: Tensor, limits: CaptureLimits, view: int | None) -> Finding
         limits=limits.workspace_fraction,
         at_least=True,
         found=f"98 % of the readings lie between {low:.3g} and {high:.3g} m",
-        advice=f"move the camera, or give the workspace of this task instead of {near:g} to {far:g} m",
+        advice="move the camera, or say how far this task's scene is with --workspace NEAR FAR, in place of "
+        f"{near:g} to {far:g} m",
         view=view,
     )
 

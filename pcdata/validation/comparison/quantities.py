@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pcdata.validation.comparison.distances import in_words
+from pcdata.verdicts import in_figures
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Quantity:
 
     def text(self, value: float) -> str:
         """Return a value with its unit."""
-        return f"{value * self.shown:.4g} {self.unit}".rstrip()
+        return f"{in_figures(value * self.shown)} {self.unit}".rstrip()
 
 
 def _rows() -> tuple[Quantity, ...]:

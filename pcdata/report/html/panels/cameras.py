@@ -15,6 +15,7 @@ from pcdata.report.html.pair_gaps import PairGap, pair_gaps
 from pcdata.report.html.text import shown
 from pcdata.validation.by_camera import CameraHistory, cameras_of
 from pcdata.validation.grading import Grading
+from pcdata.verdicts import in_figures
 
 PLANES = (  # finding, heading, unit that is shown, of it in one of the finding's
     ("plane_noise", "Noise: scatter of readings on the largest plane", "mm", 1e3),
@@ -87,7 +88,8 @@ def _plane_parts(grading: Grading) -> Iterator[str]:
         series = {view: factor * values for view, values in series_of(grading, name).items()}
         if not series:
             continue
-        middles = ", ".join(f"{shown(view, 60)} {np.nanmedian(values):.4g}" for view, values in series.items())
+        medians = {view: in_figures(float(np.nanmedian(values))) for view, values in series.items()}
+        middles = ", ".join(f"{shown(view, 60)} {middle}" for view, middle in medians.items())
         chart = curves(series, unit) if len(grading.ids) > 1 else ""
         yield f"<h3>{heading}</h3><p>Median [{unit}]: {middles}</p>{chart}"
 

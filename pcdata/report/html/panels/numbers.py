@@ -13,7 +13,7 @@ from pcdata.report.html.page import Section
 from pcdata.report.html.panels.cameras import series_of
 from pcdata.report.html.text import shown
 from pcdata.validation.grading import Trend
-from pcdata.verdicts import Verdict
+from pcdata.verdicts import Verdict, in_figures
 
 _MOST_TRENDS = 64  # time lines
 OWN_PANELS = (
@@ -86,12 +86,16 @@ def _trend(name: str, trend: Trend, ids: Sequence[str]) -> str:
     values, limit, unit = _shown_in(values, trend.worst.threshold, trend.worst.unit)
     head = f'<h3>{shown(name)} <span class="{trend.verdict}">{trend.verdict}</span></h3>'
     passes = (
-        "" if limit is None else f"; passes {'down' if trend.worst.at_least else 'up'} to {limit:.4g} {unit}".rstrip()
+        ""
+        if limit is None
+        else f"; passes {'down' if trend.worst.at_least else 'up'} to {in_figures(limit)} {unit}".rstrip()
     )
     if len(values) < 2:
-        return f"{head}<p>{values[0]:.4g} {shown(unit)}{shown(passes)}</p>"
+        return f"{head}<p>{in_figures(values[0])} {shown(unit)}{shown(passes)}</p>"
     low, high = np.nanmin(values), np.nanmax(values)
-    told = f"{low:.4g} to {high:.4g} {unit}".rstrip() + passes + (" (dashed)" if limit is not None else "")
+    told = (
+        f"{in_figures(low)} to {in_figures(high)} {unit}".rstrip() + passes + (" (dashed)" if limit is not None else "")
+    )
     spread = histogram(values, unit) if len(values) > 20 else ""
     first, last = (shown(ids[trend.places[end]], 60) for end in (0, -1))
     return (

@@ -35,7 +35,7 @@ def is_over_time(gathered: Gathered) -> bool:
     """Whether there is more to tell over time than the cameras' bands do: episodes, gaps or signals."""
     if len(gathered.grading.ids) < 2:
         return False
-    return bool(gathered.grading.episodes) or any(line.gaps or line.signals for line in gathered.lines)
+    return len(gathered.grading.episodes) > 1 or any(line.gaps or line.signals for line in gathered.lines)
 
 
 def _line(grading: Grading, line: EpisodeLine, *, is_open: bool) -> str:

@@ -13,6 +13,7 @@ from pcdata.verdicts import Verdict
 
 _OPEN = 2  # samples whose pictures are seen at once
 _MOST_FAULTS = 6  # named of one sample
+_MOST_UNREAD = 3  # lines
 
 
 def samples_panel(gathered: Gathered, scenes: Mapping[str, int]) -> Section:
@@ -23,9 +24,12 @@ def samples_panel(gathered: Gathered, scenes: Mapping[str, int]) -> Section:
         _sample(grading, one, places[one.sample_id], scenes.get(one.sample_id), is_open=number < _OPEN)
         for number, one in enumerate(gathered.looked)
     ]
-    bad = sum(grading.count(verdict) for verdict in (Verdict.WARN, Verdict.FAIL))
-    note = f"{len(gathered.looked)} of {len(grading.ids):,} captures, the worst first; {bad:,} warn or fail."
-    return Section("Samples", f'<p class="dim">{note}</p>{"".join(parts)}')
+    part, total = len(gathered.looked), len(grading.ids)
+    note = "Of the only capture." if total == 1 else f"{part} of {total:,} captures are shown, the worst first."
+    if part == total > 1:
+        note = "All captures are shown, the worst first."
+    unread = "".join(f'<p class="dim">Not read: {shown(line, 300)}.</p>' for line in gathered.unread[:_MOST_UNREAD])
+    return Section("Samples", f'<p class="dim">{note}</p>{unread}{"".join(parts)}')
 
 
 def _sample(grading: Grading, one: Looked, place: int, scene: int | None, *, is_open: bool) -> str:

@@ -8,16 +8,44 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 
 ColorManagement.enabled = false; // colors are shown as the camera gave them
 const REACH = 8; // pixels around the pointer in which a point is picked
+const MOST_TURNED = 50000; // points that a processor draws fluently
+const STILL = 250; // milliseconds without a turn after which all points are drawn
+
+function rendererOf(gl) {
+  const info = gl.getExtension("WEBGL_debug_renderer_info");
+  return String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+}
+
+/** Whether the processor draws, as there is no graphics card. */
+function drawsSlowly() {
+  const gl = document.createElement("canvas").getContext("webgl2");
+  if (!gl) return false;
+  const slow = /swiftshader|llvmpipe|softpipe|software|basic render/i.test(rendererOf(gl));
+  gl.getExtension("WEBGL_lose_context")?.loseContext();
+  return slow;
+}
+
+/** Every k-th of the rows of a matrix with three columns. */
+function everyKth(values, k) {
+  const some = new values.constructor(3 * Math.ceil(values.length / 3 / k));
+  for (let from = 0, to = 0; from < values.length; from += 3 * k)
+    for (let a = 0; a < 3; a++) some[to++] = values[from + a];
+  return some;
+}
 
 export class Stage {
   constructor(canvas) {
     this.canvas = canvas;
-    this.renderer = new WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
+    this.slow = drawsSlowly();
+    // Four samples a pixel cost a processor three quarters of its frames, and only lines look smoother.
+    this.renderer = new WebGLRenderer({ canvas, antialias: !this.slow, preserveDrawingBuffer: true });
     this.renderer.outputColorSpace = LinearSRGBColorSpace;
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     this.scene = new Scene();
     this.camera = new PerspectiveCamera(45, 1, 0.001, 1000);
     this.points = null;
+    this.fewer = null; // of them, drawn while turning where all are too many
+    this.step = 1; // every so many-th point is one of them
     this.lines = new Map();
     this.mark = null;
     this.drawn = 0; // frames
@@ -25,9 +53,7 @@ export class Stage {
   }
 
   get rendererName() {
-    const gl = this.renderer.getContext();
-    const info = gl.getExtension("WEBGL_debug_renderer_info");
-    return String(gl.getParameter(info ? info.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+    return rendererOf(this.renderer.getContext());
   }
 
   ground(color) {
@@ -58,39 +84,65 @@ export class Stage {
     this.drawn++;
   }
 
+  /** Draws fewer points until the view has been still for a moment. */
+  moves() {
+    clearTimeout(this.stills);
+    this.setTurning(true);
+    this.stills = setTimeout(() => this.setTurning(false), STILL);
+  }
+
+  setTurning(turning) {
+    if (this.fewer) {
+      this.fewer.visible = turning;
+      this.points.visible = !turning;
+    }
+    this.request();
+  }
+
   /** Draws nothing. */
   clear() {
-    if (this.points) {
-      this.scene.remove(this.points);
-      this.points.geometry.dispose();
-      this.points.material.dispose();
-      this.points = null;
-    }
+    for (const points of [this.points, this.fewer]) if (points) this.remove(points);
+    this.points = this.fewer = null;
     this.setLines([], () => false);
     this.setMark([], 0);
   }
 
   show(positions, colors, size) {
-    if (this.points) {
-      this.scene.remove(this.points);
-      this.points.geometry.dispose();
-      this.points.material.dispose();
+    for (const points of [this.points, this.fewer]) if (points) this.remove(points);
+    this.fewer = null;
+    this.step = this.slow ? Math.ceil(positions.length / 3 / MOST_TURNED) : 1;
+    this.points = this.added(positions, colors);
+    if (this.step > 1) {
+      this.fewer = this.added(everyKth(positions, this.step), everyKth(colors, this.step));
+      this.fewer.visible = false;
     }
+    this.setSize(size);
+  }
+
+  added(positions, colors) {
     const geometry = new BufferGeometry();
     geometry.setAttribute("position", new BufferAttribute(positions, 3));
     geometry.setAttribute("color", new BufferAttribute(colors, 3, true));
-    this.points = new Points(geometry, new PointsMaterial({ size, sizeAttenuation: false, vertexColors: true }));
-    this.scene.add(this.points);
-    this.request();
+    const points = new Points(geometry, new PointsMaterial({ sizeAttenuation: false, vertexColors: true }));
+    this.scene.add(points);
+    return points;
+  }
+
+  remove(points) {
+    this.scene.remove(points);
+    points.geometry.dispose();
+    points.material.dispose();
   }
 
   paint(colors) {
     this.points.geometry.setAttribute("color", new BufferAttribute(colors, 3, true));
+    if (this.fewer) this.fewer.geometry.setAttribute("color", new BufferAttribute(everyKth(colors, this.step), 3, true));
     this.request();
   }
 
   setSize(size) {
     if (this.points) this.points.material.size = size;
+    if (this.fewer) this.fewer.material.size = size * Math.min(Math.sqrt(this.step), 2); // they cover as much
     this.request();
   }
 
@@ -144,13 +196,28 @@ export class Stage {
     this.camera.up.set(...up);
     this.camera.near = radius / 200;
     this.camera.far = radius * 200;
-    const distance = (1.1 * radius) / Math.sin((this.camera.fov * Math.PI) / 360);
-    this.camera.position.copy(center).addScaledVector(new Vector3(...toward).normalize(), distance);
+    this.resize(); // sets the shape of the image
+    const back = new Vector3(...toward).normalize();
+    this.camera.position.copy(center).addScaledVector(back, this.distance(center, lower, upper, up, back));
     this.controls = new OrbitControls(this.camera, this.canvas);
     this.controls.target.copy(center);
-    this.controls.addEventListener("change", () => this.request());
     this.controls.update();
-    this.resize();
+    this.controls.addEventListener("change", () => this.moves());
+    this.request();
+  }
+
+  /** From how far all corners of a box are inside the image, with a margin. */
+  distance(center, lower, upper, up, back) {
+    const right = new Vector3(...up).cross(back).normalize();
+    const above = back.clone().cross(right);
+    const tangent = Math.tan((this.camera.fov * Math.PI) / 360) / 1.1;
+    let far = 1e-6;
+    for (let corner = 0; corner < 8; corner++) {
+      const at = new Vector3(...[0, 1, 2].map((a) => (corner & (1 << a) ? upper : lower)[a])).sub(center);
+      const aside = Math.max(Math.abs(at.dot(right)) / this.camera.aspect, Math.abs(at.dot(above)));
+      far = Math.max(far, at.dot(back) + aside / tangent);
+    }
+    return far;
   }
 
   turn(around, above) {
@@ -202,13 +269,17 @@ export class Stage {
     return best;
   }
 
-  /** Frames per second while turning around once, drawn one after another without waiting for the screen. */
-  async measure(frames = 60) {
+  /**
+   * Frames per second while turning around once, drawn one after another without waiting for the screen; of all points,
+   * or of those that are drawn while somebody turns.
+   */
+  async measure(frames = 60, all = true) {
     const gl = this.renderer.getContext();
     const pixel = new Uint8Array(4);
     const begun = performance.now();
     for (let i = 0; i < frames; i++) {
       this.turn((2 * Math.PI) / frames, 0);
+      this.setTurning(!all);
       this.draw();
       gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel); // waits until it is drawn
     }
