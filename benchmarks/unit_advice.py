@@ -45,7 +45,9 @@ UNITS = [
     DepthUnit(0.0001, "rotated"),
     DepthUnit(1.0),
 ]
-OPTION = re.compile(r"metres_per_unit=([0-9.e-]+)(?:, depth_encoding=(\w+))?")
+OPTION = re.compile(
+    r"(?:metres_per_unit=|--metres-per-unit )([0-9.e-]+)(?:(?:, depth_encoding=| --depth-encoding )(\w+))?"
+)
 FITS = 0.3  # of the pixels must fit into 16 bits
 
 

@@ -11,7 +11,7 @@ import pytest
 from pcdata.calibration import CalibrationLimits
 from pcdata.errors import ConfigError
 from pcdata.validation import CaptureLimits, DriftLimits, OverlapLimits
-from pcdata.verdicts import Finding, Limits, Verdict, at_least, at_most, graded, judged, worst
+from pcdata.verdicts import Finding, Limits, Verdict, at_least, at_most, graded, in_figures, judged, worst
 
 TABLES = (CaptureLimits, OverlapLimits, CalibrationLimits, DriftLimits)
 
@@ -71,3 +71,14 @@ def test_limits_that_cannot_hold_are_refused_by_name(table):
         for value in bad:
             with pytest.raises(ConfigError, match=rf"{table.__name__}: {field.name}"):
                 table(**{field.name: value})
+
+
+@pytest.mark.parametrize(
+    ("value", "told"),
+    [
+        *((280_900.0, "280,900"), (1000.0, "1,000"), (999.94, "999.9"), (-4_500_000.2, "-4,500,000"), (0.0, "0")),
+        *((0.000123456, "0.0001235"), (0.00002, "0.00002"), (1.0, "1"), (math.nan, "nan"), (math.inf, "inf")),
+    ],
+)
+def test_numbers_are_written_as_they_are_read(value, told):
+    assert in_figures(value) == told

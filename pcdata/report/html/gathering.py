@@ -234,7 +234,8 @@ def _looked(
         if first is None:
             return stages
         shown = first if overlap is None else overlap.shown_on(first, each)
-        return (stage_of("capture", shown, most_points=each, total=first.num_points), *stages)
+        told = "cloud" if isinstance(capture, PointCloud) else "capture"
+        return (stage_of(told, shown, most_points=each, total=first.num_points), *stages)
 
     most_bytes = _MOST_BYTES // max(num_shown, 1)
     most_points = min(2 * MOST_POINTS, most_bytes // _BYTES_PER_POINT)

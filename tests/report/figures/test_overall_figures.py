@@ -57,7 +57,7 @@ def test_pictures_come_in_the_order_of_the_page(gathered):
 def test_the_summary_has_reasons_first_then_since_when_each_camera_is_off(gathered):
     _, summary = next(_figures(gathered))
     verdict, cameras, funnel = summary.axes
-    assert "fail view_pose view 1 (front), in 3 of 6 captures, from 'f3' on" in texts(verdict)
+    assert "fail view_pose view 1 (front), in 3 of 6 captures, from 'f3' on" in " ".join(texts(verdict).split())
     assert "view 1 (front)  fail view_pose: from 'f3' on, in 3 of 6 captures" in texts(cameras)
     left, front, right = cameras.images
     assert severities(front) == [0] * MOVED_FROM + [3] * (NUM_FRAMES - MOVED_FROM)

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 
-from pcdata import Compose
+from pcdata import Camera, Compose, DepthFrame, PointCloud
 from pcdata.report.html.capture_report import page_of_captures
 from pcdata.report.html.charts import curves, strip, time_line
 from pcdata.report.html.gathering import Gathered, gather_captures
 from pcdata.report.html.overlaps import GAP, overlap_of
-from pcdata.report.html.scene import raw_cloud
+from pcdata.report.html.scene import raw_cloud, stage_of
 from pcdata.report.html.unpacking import unpack_cloud
 from pcdata.synthetic import tabletop
 from pcdata.transforms import ClusterObjects, Deproject, MergeViews, NormalizeUnitSphere, RemovePlane, ToFrame
@@ -181,3 +181,35 @@ def test_what_was_not_measured_is_no_pass_of_a_camera():
     assert camera.severities.tolist() == [1, 0]
     assert camera.name == "view 0"  # captures name it differently
     assert camera.since == ""
+
+
+def test_the_view_is_of_what_is_near_where_far_things_lie_behind():
+    generator = torch.Generator().manual_seed(0)
+    table = torch.rand(4000, 3, generator=generator) * torch.tensor([0.8, 0.5, 0.1]) + torch.tensor([-0.4, -0.25, 0.9])
+    wall = torch.rand(6000, 3, generator=generator) * torch.tensor([5.0, 4.0, 0.5]) + torch.tensor([-2.5, -2.0, 3.0])
+    for points, far in ((torch.cat([table, wall]), 1.2), (table, 1.2), (wall, 4.0)):
+        cloud = PointCloud(points=points, frame_id="camera", viewpoint=torch.zeros(1, 3))
+        view = stage_of("", cloud).cloud.said["view"]
+        assert view["upper"][2] < far
+        assert view["upper"][2] > points[:, 2].min()
+
+
+def test_where_a_cut_background_explains_the_holes_no_exposure_is_raised():
+    depth = torch.full((120, 160), 0.8)
+    depth[:, :70] = 0
+    advice = {kind: _advice(frame) for kind, frame in (("cut", depth), ("sparse", _sparse(0.5)))}
+    assert advice["cut"].startswith("one region explains it: right where the background was cut away on purpose")
+    assert advice["sparse"].startswith("raise the exposure")
+
+
+def _sparse(share: float) -> torch.Tensor:
+    read = torch.rand(120, 160, generator=torch.Generator().manual_seed(0)) < share
+    return torch.where(read, 0.8, 0.0)
+
+
+def _advice(depth: torch.Tensor) -> str:
+    camera = Camera.pinhole(fx=150, fy=150, cx=80, cy=60, size=(120, 160))
+    found = validate_frame(DepthFrame(depth=depth[None], camera=camera))
+    (finding,) = [one for one in found if one.name == "valid_fraction"]
+    assert finding.verdict is not Verdict.PASS
+    return finding.advice

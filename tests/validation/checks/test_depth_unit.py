@@ -25,7 +25,9 @@ UNITS = [
     DepthUnit(1.0),
 ]
 FOCAL = 300.0
-OPTION = re.compile(r"metres_per_unit=([0-9.e-]+)(?:, depth_encoding=(\w+))?")
+OPTION = re.compile(
+    r"(?:metres_per_unit=|--metres-per-unit )([0-9.e-]+)(?:(?:, depth_encoding=| --depth-encoding )(\w+))?"
+)
 
 
 @cache
@@ -141,4 +143,4 @@ def test_depth_in_tenths_of_a_millimeter_read_as_millimeters_never_passes_and_is
     (finding,) = (one for one in report.findings if one.name == "depth_unit")
     assert report.verdict is Verdict.FAIL
     assert finding.verdict in (Verdict.WARN, Verdict.FAIL)
-    assert "metres_per_unit=0.0001" in finding.advice
+    assert "--metres-per-unit 0.0001" in finding.advice

@@ -30,5 +30,10 @@ def left_out_panel(gathered: Gathered) -> Section | None:
 def made_panel(gathered: Gathered) -> Section:
     """The source, the versions and the steps."""
     versions = f"pcdata {__version__}, torch {torch.__version__}, Python {platform.python_version()}"
-    steps = f"<pre>{shown(gathered.pipeline, 20_000)}</pre>" if gathered.pipeline else "<p>No pipeline was given.</p>"
+    steps = (
+        "<details><summary>the steps, with all their fields</summary>"
+        f"<pre>{shown(gathered.pipeline, 20_000)}</pre></details>"
+        if gathered.pipeline
+        else "<p>No pipeline was given; --config FILE.yaml shows what its steps leave.</p>"
+    )
     return Section("How this was made", f"<p>Of {shown(gathered.source)}. {shown(versions)}.</p>{steps}")

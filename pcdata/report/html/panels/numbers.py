@@ -48,9 +48,9 @@ def objects_panel(gathered: Gathered) -> Section | None:
     counts = series_of(gathered.grading, "object_count").get("object_count")
     sizes = series_of(gathered.grading, "object_size").get("object_size")
     if counts is not None:
-        parts.append(f"<h3>Objects in a sample</h3>{histogram(counts, 'objects')}")
+        parts.append(f"<h3>Objects in a sample</h3>{_spread(counts, 'objects')}")
     if sizes is not None:
-        parts.append(f"<h3>Longest edge, the median of a sample</h3>{histogram(100 * sizes, 'cm')}")
+        parts.append(f"<h3>Longest edge, the median of a sample</h3>{_spread(100 * sizes, 'cm')}")
     boxes = [(one.sample_id, one.objects) for one in gathered.looked if one.objects is not None]
     if boxes:
         rows = "".join(
@@ -60,6 +60,16 @@ def objects_panel(gathered: Gathered) -> Section | None:
         head = "<tr><th>sample</th><th>objects</th><th>boxes, length x width x height [cm]</th></tr>"
         parts.append(f'<h3>In the samples that are shown</h3><div class="wide"><table>{head}{rows}</table></div>')
     return Section("Objects", "".join(parts)) if parts else None
+
+
+def _spread(values: NDArray[np.float64], unit: str) -> str:
+    """A histogram; in words where all numbers are one."""
+    finite = values[np.isfinite(values)]
+    if len(finite) and finite.min() == finite.max():
+        return (
+            f"<p>{in_figures(float(finite[0]))} {unit} in {'every sample' if len(finite) > 1 else 'the only one'}</p>"
+        )
+    return histogram(values, unit)
 
 
 def _sizes(boxes: Sequence[tuple[float, float, float]]) -> str:

@@ -27,7 +27,7 @@ def samples_panel(gathered: Gathered, scenes: Mapping[str, int]) -> Section:
     part, total = len(gathered.looked), len(grading.ids)
     note = "Of the only capture." if total == 1 else f"{part} of {total:,} captures are shown, the worst first."
     if part == total > 1:
-        note = "All captures are shown, the worst first."
+        note = f"All {total} captures are shown, the worst first."
     unread = "".join(f'<p class="dim">Not read: {shown(line, 300)}.</p>' for line in gathered.unread[:_MOST_UNREAD])
     return Section("Samples", f'<p class="dim">{note}</p>{unread}{"".join(parts)}')
 
@@ -42,12 +42,22 @@ def _sample(grading: Grading, one: Looked, place: int, scene: int | None, *, is_
         for told, uri in ((shown(picture.caption), png_uri(picture.png)) for picture in one.pictures)
     )
     head = (
-        f'<b>{shown(one.sample_id, 200)}</b> <span class="{verdict}">{verdict}</span> {_faults(grading, place)} {link}'
+        f'<b>{shown(one.sample_id, 200)}</b> <span class="{verdict}">{verdict}</span> {_faults(grading, place)} '
+        f'<span class="dim">{_counted(one)}</span> {link}'
     )
     if not figures:
         return f'<p class="row">{head}</p>{problem}'
     opened = " open" if is_open else ""
     return f'<details{opened}><summary>{head}</summary>{problem}<div class="pictures">{figures}</div></details>'
+
+
+def _counted(one: Looked) -> str:
+    """How many points and objects a sample has in the end."""
+    if one.scene is None:
+        return ""
+    points = one.scene.stages[-1].cloud.said["total"]
+    objects = "" if one.objects is None else f", {len(one.objects)} object{'s' * (len(one.objects) != 1)}"
+    return f"{points:,} point{'s' * (points != 1)}{objects}"
 
 
 def _faults(grading: Grading, place: int) -> str:
