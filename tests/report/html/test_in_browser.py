@@ -173,6 +173,7 @@ def test_every_choice_changes_what_is_drawn(visit, steps):
     until(tab, "![...document.querySelectorAll('#color option')].some((one) => one.textContent === 'normals')")
     assert tab.evaluate("window.pcdata.step") == 2
     axis = tab.get_by_label("x axis")
+    tab.evaluate("window.pcdata.stage.zoom(3)")  # the frame's origin lies beside what is looked at
     with_axis = pixels(tab)
     axis.uncheck()
     assert (with_axis != pixels(tab)).any()
@@ -288,3 +289,25 @@ def contrast(one: str, other: str) -> float:
 
     low, high = sorted([lightness(one), lightness(other)])
     return (high + 0.05) / (low + 0.05)
+
+
+def test_fewer_points_turn_and_all_stand_still(visit):
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(120_000, 3, generator=generator)
+    tab = visit(PointCloud(points=points, colors=points, frame_id="base").show(max_points=200_000))
+    shown = "[window.pcdata.stage.points, window.pcdata.stage.fewer].map((one) => one.visible)"
+    counts = (
+        "[window.pcdata.stage.points, window.pcdata.stage.fewer].map((one) => one.geometry.attributes.COLUMN.count)"
+    )
+    assert tab.evaluate("window.pcdata.stage.slow")  # the processor draws here
+    until(tab, "!window.pcdata.stage.fewer.visible")
+    still = pixels(tab)
+    for column in ("position", "color"):
+        assert tab.evaluate(counts.replace("COLUMN", column)) == [120_000, 40_000]
+    assert tab.evaluate(f"(window.pcdata.stage.turn(0.1, 0), {shown})") == [False, True]
+    until(tab, "window.pcdata.stage.points.visible")
+    assert (still != pixels(tab)).any()
+    row = tab.evaluate("window.pcdata.stage.pick(...window.pcdata.stage.drawnAt([0.5, 0.5, 1]))")
+    assert row >= 0
+    tab.evaluate("window.pcdata.nextColor()")
+    assert tab.evaluate(counts.replace("COLUMN", "color")) == [120_000, 40_000]
