@@ -124,7 +124,7 @@ def test_a_wrong_unit_given_on_the_command_line_is_a_failed_check(capsys, folder
     code, out, _ = run(capsys, folder, "--metres-per-unit", 0.01)
     assert code == 1
     assert "FAIL depth_unit" in out
-    assert "metres_per_unit=0.001" in out
+    assert "--metres-per-unit 0.001" in out
 
 
 def test_clouds_are_judged_too(capsys, tmp_path: Path) -> None:
