@@ -29,7 +29,8 @@ SET_UP = getattr(torch.utils.backend_registration, "_setup_privateuseone_for_pyt
 AVAILABLE = SET_UP is not None
 HOST = torch.device("cpu")
 
-# The host waits for these: a number is asked for, or the size of the result is a value of the device.
+# The host waits for these: a number is asked for, or the size of the result is a value of the device. It waits for a
+# copy to the device too, unless that is said to be non-blocking.
 WAITS = {
     "_local_scalar_dense",
     "_unique2",
@@ -144,7 +145,7 @@ def run(function: Any, arguments: tuple, options: dict) -> Any:
     target = options.get("device")
     if of_host and len(of_host) < len(tensors):
         if name in MAY_MIX:
-            _mixed(name, tensors)
+            _mixed(name, tensors, is_blocking=not any(value is True for value in given))
         elif any(tensor.ndim for tensor in of_host):
             raise RuntimeError(f"Expected all tensors to be on the same device: aten::{name} got {NAME} and cpu")
     if name in WAITS or (name in INDEXING and _has_mask(tensors[1:2])):
@@ -155,7 +156,7 @@ def run(function: Any, arguments: tuple, options: dict) -> Any:
     if to_host:
         _waited("to the host")
     if name == "_to_copy" and not any(isinstance(tensor, PretendTensor) for tensor in tensors):
-        _uploaded(name)
+        _uploaded(name, waits=not options.get("non_blocking"))
     if name not in VIEWS:
         for watched in _watching:
             watched.launches += 1
@@ -169,13 +170,13 @@ def run(function: Any, arguments: tuple, options: dict) -> Any:
     return tree_map(lambda value: own[id(value)] if id(value) in own else _outer(value), found)
 
 
-def _mixed(name: str, tensors: list[Tensor]) -> None:
+def _mixed(name: str, tensors: list[Tensor], *, is_blocking: bool) -> None:
     if name == "copy_" and not isinstance(tensors[0], PretendTensor):
         _waited("copy_ to the host")
     elif name in INDEXING and not isinstance(tensors[0], PretendTensor):
         raise RuntimeError(f"indices should be on the same device as the indexed tensor (cpu): aten::{name}")
     elif any(tensor.ndim for tensor in tensors if not isinstance(tensor, PretendTensor)):
-        _uploaded(name)
+        _uploaded(name, waits=is_blocking or name in INDEXING)
 
 
 def _has_mask(tensors: list[Tensor]) -> bool:
@@ -203,7 +204,9 @@ def _waited(what: str) -> None:
         watched.waits[f"{what} in {_place()}"] += 1
 
 
-def _uploaded(what: str) -> None:
+def _uploaded(what: str, *, waits: bool) -> None:
+    if waits:
+        _waited(f"upload by {what}")
     for watched in _watching:
         watched.uploads[f"{what} in {_place()}"] += 1
 
@@ -236,7 +239,10 @@ def _register() -> None:
 
 
 def _copy_from(source: Tensor, target: Tensor, non_blocking: bool = False) -> Tensor:
-    (_uploaded if isinstance(target, PretendTensor) else _waited)("copy_")
+    if isinstance(target, PretendTensor):
+        _uploaded("copy_", waits=not non_blocking)
+    else:
+        _waited("copy_")
     host(target).copy_(host(source))
     return target
 

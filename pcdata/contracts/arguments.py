@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pcdata.contracts.fields import Fields
 from pcdata.contracts.numbers import Spec
+from pcdata.contracts.on_host import uploaded
 from pcdata.contracts.tensors import check_tensors, parse_spec
 from pcdata.errors import DeviceError, DTypeError, ShapeError
 
@@ -95,7 +96,8 @@ class Contract:
                 if rows is None:
                     raise ShapeError(f"{self.name}: {pointers} was given without {key}; pass both or neither")
             elif isinstance(rows, Tensor) and rows.ndim:
-                arguments[pointers] = torch.tensor([0, rows.shape[0]], dtype=torch.int64, device=rows.device)
+                one = torch.tensor([0, rows.shape[0]], dtype=torch.int64, device="cpu")
+                arguments[pointers] = uploaded(one, rows.device)
         check_tensors(self.name, arguments, self.tensors)
         for key, spec in self.others.items():
             if arguments[key] is not None or key not in self._optional:

@@ -13,20 +13,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pcdata.contracts.known import FINITE, NOT_NEGATIVE, is_known
+from pcdata.contracts.on_host import held, on_host, uploaded
+
 
 def all_finite(values: Tensor) -> bool:
     """Say whether no value is NaN or infinite."""
     if values.device.type == "cpu":
         # Not .all(), which is Python that calls this.
         return bool(np.logical_and.reduce(np.isfinite(values.detach().numpy()), axis=None))
-    return bool(torch.isfinite(values).all())
+    if (copy := held(values)) is not None:
+        return all_finite(copy)
+    return is_known(FINITE, values) or bool(torch.isfinite(values).all())
 
 
 def any_negative(values: Tensor) -> bool:
     """Say whether a value is below 0; NaN is not."""
     if values.device.type == "cpu":
         return bool(np.logical_or.reduce(values.detach().numpy() < 0, axis=None))
-    return bool((values < 0).any())
+    if (copy := held(values)) is not None:
+        return any_negative(copy)
+    return not is_known(NOT_NEGATIVE, values) and bool((values < 0).any())
 
 
 def any_above(values: Tensor, limit: int) -> bool:
@@ -74,12 +81,12 @@ def checksums(values: Tensor, bounds: list[int], first: list[int] | None = None)
 
 def rising(values: Tensor, ptr: Tensor) -> bool:
     """Say whether the (N,) values of every segment rise strictly."""
-    starts = ptr[1:-1]
+    starts = on_host(ptr)[1:-1]
     starts = starts[(starts > 0) & (starts < len(values))]
     if values.device.type == "cpu":
         array = values.numpy()
         rises = torch.from_numpy(array[1:] > array[:-1])
     else:
         rises = values[1:] > values[:-1]
-    rises[starts - 1] = True
+    rises[uploaded(starts - 1, values.device)] = True
     return count_true(rises) == len(rises)

@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.contracts.on_host import bounds_of, on_host, uploaded
 from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError, near_matches
 
 # Returns ``arguments[name]`` as bodies get it; tensors, row pointers among them, are checked already. ``where`` is the
@@ -85,7 +86,7 @@ def checked_counts(where: str, name: str, arguments: Mapping[str, Any]) -> list[
 def checked_lengths(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
     """Require one positive length for every cloud, or one per cloud (B,); bodies get (B,) float64."""
     ptr: Tensor = arguments["ptr"]
-    lengths = torch.as_tensor(arguments[name], dtype=torch.float64, device=ptr.device).detach()
+    lengths = numbers_on_host(arguments[name])
     num_clouds = len(ptr) - 1
     if lengths.ndim == 0:
         lengths = lengths.expand(num_clouds)
@@ -93,13 +94,13 @@ def checked_lengths(where: str, name: str, arguments: Mapping[str, Any]) -> Tens
         raise ShapeError(f"{where}: {name} must be one number or ({num_clouds},), got {tuple(lengths.shape)}")
     if not bool((torch.isfinite(lengths) & (lengths > 0)).all()):
         raise ConfigError(f"{where}: {name} must be positive, got {lengths.tolist()}")
-    return lengths
+    return uploaded(lengths, ptr.device)
 
 
 def checked_edges(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
     """Require lengths as :func:`checked_lengths`, or one per axis too, (1 or B, 3): bodies get (B,) or (B, 3)."""
     ptr: Tensor = arguments["ptr"]
-    edges = torch.as_tensor(arguments[name], dtype=torch.float64, device=ptr.device).detach()
+    edges = numbers_on_host(arguments[name])
     num_clouds = len(ptr) - 1
     if edges.ndim != 2:
         return checked_lengths(where, name, arguments)
@@ -107,19 +108,27 @@ def checked_edges(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor
         raise ShapeError(f"{where}: {name} per axis must be (1, 3) or ({num_clouds}, 3), got {tuple(edges.shape)}")
     if not bool((torch.isfinite(edges) & (edges > 0)).all()):
         raise ConfigError(f"{where}: {name} must be positive, got {edges.tolist()}")
-    return edges.expand(num_clouds, 3)
+    return uploaded(edges.expand(num_clouds, 3), ptr.device)
 
 
 def checked_places(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
     """Require one finite point (3,) for every cloud, or one per cloud (B, 3); bodies get (B, 3) float64."""
     ptr: Tensor = arguments["ptr"]
-    places = torch.as_tensor(arguments[name], dtype=torch.float64, device=ptr.device).detach()
+    places = numbers_on_host(arguments[name])
     num_clouds = len(ptr) - 1
     if places.shape not in {(3,), (num_clouds, 3)}:
         raise ShapeError(f"{where}: {name} must be (3,) or ({num_clouds}, 3), got {tuple(places.shape)}")
     if not bool(torch.isfinite(places).all()):
         raise ConfigError(f"{where}: {name} must be finite, got {places.tolist()}")
-    return places.expand(num_clouds, 3)
+    return uploaded(places.expand(num_clouds, 3), ptr.device)
+
+
+def numbers_on_host(numbers: Any) -> Tensor:
+    """Return a few numbers as float64 of the host's own: nobody changes what is known of their copy elsewhere."""
+    if isinstance(numbers, Tensor):
+        numbers = on_host(numbers)
+        return numbers.double() if numbers.dtype is not torch.float64 else numbers.clone()
+    return torch.as_tensor(numbers, dtype=torch.float64, device="cpu").detach()
 
 
 def counts_per_cloud(where: str, num_samples: int | Sequence[int] | Tensor, ptr: Tensor) -> list[int]:
@@ -151,7 +160,7 @@ def require_rows(where: str, wanted: Sequence[int], ptr: Tensor) -> None:
     Raises:
         TooFewPointsError: the first cloud that has not.
     """
-    bounds = ptr.tolist()
+    bounds = bounds_of(ptr)
     for cloud, count in enumerate(wanted):
         available = bounds[cloud + 1] - bounds[cloud]
         if count > available:

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from pcdata.contracts.host import all_finite, any_negative
 from pcdata.contracts.known import FINITE, NOT_NEGATIVE, is_known, note
+from pcdata.contracts.on_host import bounds_of, held, hold, read_together
 from pcdata.errors import CaptureError, DeviceError, DTypeError, NonFiniteError, ShapeError, TooFewPointsError
 
 _DTYPES: dict[str, tuple[torch.dtype, ...]] = {
@@ -83,7 +84,8 @@ def check_tensors(
         values: argument name to tensor.
         specs: argument name to contract string.
         finite: also require float values to be finite.
-        check_values: also read values (row pointers, finiteness); on CUDA this waits for the device.
+        check_values: also read values (row pointers, finiteness); on CUDA the host waits once for all of those that
+            are not known, see :mod:`pcdata.contracts.known`.
 
     Returns:
         The size bound to every named dimension.
@@ -94,6 +96,7 @@ def check_tensors(
     sizes: dict[str, int] = {}
     bound_by: dict[str, str] = {}
     device: tuple[str, torch.device] | None = None
+    there: dict[str, Tensor] = {}  # whose values are to be read
     for name, text in specs.items():
         value = values.get(name)
         if value is None:
@@ -112,8 +115,13 @@ def check_tensors(
             raise DeviceError(
                 f"{where}: {name} is on {value.device} but {device[0]} is on {device[1]}; move one with .to()"
             )
-        if not check_values:
-            continue
+        there[name] = value
+    if not check_values:
+        return sizes
+    if device is not None and device[1].type != "cpu":
+        _read_values(there, specs, finite=finite)
+    for name, value in there.items():
+        spec = parse_spec(specs[name])
         if spec.is_ptr:
             check_ptr_values(where, name, value, sizes.get(spec.dims[0]))
             if spec.least:
@@ -129,6 +137,28 @@ def check_tensors(
     return sizes
 
 
+def _read_values(values: Mapping[str, Tensor], specs: Mapping[str, str], *, finite: bool) -> None:
+    """Read what is not known of values on another device, all at once."""
+    pointers, asked = [], []
+    for name, value in values.items():
+        spec = parse_spec(specs[name])
+        if held(value) is not None:
+            continue
+        if spec.is_ptr:
+            pointers.append(value)
+            continue
+        if finite and value.dtype.is_floating_point and not is_known(FINITE, value):
+            asked.append((FINITE, value, torch.isfinite(value).all()))
+        if spec.is_depth and not is_known(NOT_NEGATIVE, value):
+            asked.append((NOT_NEGATIVE, value, ~(value < 0).any()))
+    answers = read_together([*pointers, *(answer for _, _, answer in asked)])
+    for ptr, bounds in zip(pointers, answers):
+        hold(ptr, torch.tensor(bounds, dtype=torch.int64, device="cpu"))
+    for (fact, value, _), (answer,) in zip(asked, answers[len(pointers) :]):
+        if answer:
+            note(fact, value)
+
+
 def _known_finite(value: Tensor) -> bool:
     """Say whether all values are finite; within a chain each tensor is read once."""
     if is_known(FINITE, value):
@@ -141,7 +171,7 @@ def _known_finite(value: Tensor) -> bool:
 
 def check_ptr_values(where: str, name: str, ptr: Tensor, num_rows: int | None) -> None:
     """Require row pointers that start at 0, never decrease, and end at ``num_rows`` (None: any end)."""
-    bounds = ptr.tolist()
+    bounds = bounds_of(ptr)
     if bounds[0] != 0 or bounds != sorted(bounds):
         raise ShapeError(f"{where}: {name} must start at 0 and never decrease, got {_short(bounds)}")
     if num_rows is not None and bounds[-1] != num_rows:
@@ -166,7 +196,7 @@ def check_depths(where: str, name: str, depths: Tensor) -> None:
 
 
 def _require_rows(where: str, ptr: Tensor, spec: _TensorSpec, rows: str) -> None:
-    bounds = ptr.tolist()
+    bounds = bounds_of(ptr)
     counts = [stop - start for start, stop in pairwise(bounds)]
     if min(counts) < spec.least:
         short = [cloud for cloud, count in enumerate(counts) if count < spec.least]

@@ -8,9 +8,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from pcdata.contracts.numbers import whole_number
+from pcdata.contracts.on_host import counts_of
 from pcdata.datasets.window_batch import WindowBatch, window_batch
 from pcdata.errors import ConfigError, DTypeError, ShapeError
-from pcdata.functional.rows import listed_counts
 from pcdata.registry import Registry
 from pcdata.structures import PaddedClouds, PointCloud
 from pcdata.structures.unbatched import Unbatched
@@ -85,7 +85,7 @@ def collate_fixed(clouds: Sequence[PointCloud]) -> PaddedClouds:
     """
     _check("collate_fixed", clouds)
     batches = clouds.batches if isinstance(clouds, Unbatched) else clouds
-    counts = {*itertools.chain.from_iterable(listed_counts(batch.ptr) for batch in batches)}
+    counts = {*itertools.chain.from_iterable(counts_of(batch.ptr) for batch in batches)}
     if len(counts) > 1:
         raise ShapeError(
             f"collate_fixed: clouds must have one count, got {min(counts)} to {max(counts)} points; end the pipeline "

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_lengths, require_length
+from pcdata.contracts.on_host import bounds_of
 from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.nearest import pair_chunks
 from pcdata.functional.neighbors import ball_query, nearest_rows, radius_neighbors
@@ -43,7 +44,7 @@ def density_clusters(
     for pairs in pair_chunks(points, ptr, points, ptr):
         core[pairs.query] = (pairs.squared < limit).sum(1) >= min_points
     label = torch.full_like(core, -1, dtype=torch.int64)
-    for start, stop in pairwise(ptr.tolist()):
+    for start, stop in pairwise(bounds_of(ptr)):
         rows = start + core[start:stop].nonzero().squeeze(1)
         label[rows] = _clusters(points[rows], limit)
     # Borders take the lowest label of the core points in reach.

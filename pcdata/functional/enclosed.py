@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from pcdata.contracts.on_host import bounds_of
 from pcdata.functional.image_clusters import linked_pixels
 from pcdata.functional.image_grid import ImageGrid, is_lined
 
@@ -42,7 +43,7 @@ def enclosed_points(
         backend: which body finds connected pixels.
     """
     enclosed = torch.zeros_like(something)
-    for start, stop in pairwise(ptr.tolist()):
+    for start, stop in pairwise(bounds_of(ptr)):
         own, pixel = something[start:stop], grid.pixel_index[start:stop]
         if not bool(own.any()):
             continue

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_count, checked_edges, checked_places
+from pcdata.contracts.on_host import on_host, uploaded
 from pcdata.errors import ConfigError
-from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, group_count, ptr_from_counts
 from pcdata.functional.voxels import group_in_row_order, voxel_keys
 
 
@@ -72,27 +73,30 @@ def hard_voxels(
     """
     assert ptr is not None  # @op fills it
     assert isinstance(voxel_size, Tensor)  # and makes it (B,) or (B, 3)
+    low, high, sides = (on_host(one).float() for one in (lower, upper, voxel_size))
+    sides = sides if sides.ndim == 2 else sides[:, None].expand(-1, 3)
     edges = voxel_size if voxel_size.ndim == 2 else voxel_size[:, None].expand(-1, 3)
-    shape = ((upper.float() - lower.float()) / edges.float()).round().long()
+    shape = ((high - low) / sides).round().long()
     for b in (shape < 1).any(1).nonzero().squeeze(1).tolist():
         raise ConfigError(
             f"hard_voxels: the grid of cloud {b} has no voxel: lower {lower[b].tolist()}, upper {upper[b].tolist()}, "
             f"voxel_size {edges[b].tolist()}"
         )
+    shape = uploaded(shape, points.device)
     cloud = cloud_of_rows(ptr)
     place = ((points - lower.float()[cloud]) / edges.float()[cloud]).floor()
     row = ((place >= 0) & (place < shape[cloud])).all(1).nonzero().squeeze(1)
     owner, cell = cloud[row], place[row].long()
     voxel, first = group_in_row_order(voxel_keys(owner, cell, len(ptr) - 1))
     # The number of each voxel among those of its cloud; rows of clouds follow one another, so voxels do too.
-    counts = torch.bincount(owner[first], minlength=len(ptr) - 1)
+    counts = group_count(owner[first], len(ptr) - 1)
     number = (
         torch.arange(len(first), dtype=torch.int64, device=points.device) - (counts.cumsum(0) - counts)[owner[first]]
     )
     kept = number < max_voxels
     new = kept.cumsum(0) - 1
     order = voxel.argsort(stable=True)
-    sizes = torch.bincount(voxel, minlength=len(first))
+    sizes = group_count(voxel, len(first))
     rank = torch.arange(len(row), dtype=torch.int64, device=points.device) - (sizes.cumsum(0) - sizes)[voxel[order]]
     taken = (rank < max_points) & kept[voxel[order]]
     table = torch.full((int(kept.sum()), max_points), len(points), dtype=torch.int64, device=points.device)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pcdata.contracts.host import rising
 from pcdata.contracts.known import RIGID, is_known, note
+from pcdata.contracts.on_host import on_host
 from pcdata.errors import ConfigError, DeviceError, DTypeError, ShapeError
 from pcdata.functional.rows import counts_from_ptr
 from pcdata.geometry.rigid import are_few_and_rigid
@@ -97,9 +98,9 @@ def _check_rigid(where: str, motion: Tensor, num_clouds: int, device: torch.devi
         raise DeviceError(f"{name} is on {motion.device} but points is on {device}; move one with .to()")
     if is_known(RIGID, motion) or are_few_and_rigid(motion, tolerance=_MOST_OFF):
         return
-    wide = motion.double()
+    wide = on_host(motion).double()
     rotation, last = wide[:, :3, :3], wide[:, 3]
-    off = (rotation.mT @ rotation - torch.eye(3, dtype=wide.dtype, device=device)).abs().amax((1, 2))
+    off = (rotation.mT @ rotation - torch.eye(3, dtype=wide.dtype, device="cpu")).abs().amax((1, 2))
     off = torch.maximum(off, (last - last.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(1))
     # NaN fails too.
     wrong = (~(off <= _MOST_OFF) | ~torch.isfinite(wide).all(2).all(1)).nonzero().squeeze(1).tolist()

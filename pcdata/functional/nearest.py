@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
+from pcdata.contracts.on_host import bounds_of
 from pcdata.functional.radius import squared_radius
 from pcdata.threads import at_once
 
@@ -45,8 +46,8 @@ def nearest_chunks(
     if queries is None or queries_ptr is None:
         queries, queries_ptr = points, ptr
     limit = squared_radius(radius, points.device)
-    infinity = torch.tensor(torch.inf, dtype=torch.float32, device=points.device)
-    missing = _order(infinity, torch.tensor(len(points), dtype=torch.int64, device=points.device))
+    infinity = torch.full((), torch.inf, dtype=torch.float32, device=points.device)
+    missing = _order(infinity, torch.full((), len(points), dtype=torch.int64, device=points.device))
     for pairs in pair_chunks(points, ptr, queries.detach(), queries_ptr):
         below = limit[pairs.query, None] if limit.ndim else limit
         order = torch.where(pairs.squared < below, _order(pairs.squared, pairs.row), missing)
@@ -71,7 +72,7 @@ class _Pairs:
 
 def pair_chunks(points: Tensor, ptr: Tensor, queries: Tensor, queries_ptr: Tensor) -> Iterator[_Pairs]:
     """Yield all pairs of a query and a point of the same cloud; each query is in one chunk."""
-    for (start, stop), (first, last) in zip(pairwise(ptr.tolist()), pairwise(queries_ptr.tolist()), strict=True):
+    for (start, stop), (first, last) in zip(pairwise(bounds_of(ptr)), pairwise(bounds_of(queries_ptr)), strict=True):
         row = torch.arange(start, stop, dtype=torch.int64, device=points.device)
         some = max(1, at_once(points.device, _PAIRS) // max(1, stop - start))
         for query in torch.arange(first, last, dtype=torch.int64, device=points.device).split(some):

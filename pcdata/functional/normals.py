@@ -77,7 +77,7 @@ def estimate_normals(
         # Offsets from the query keep all digits however far the cloud lies from the origin.
         offset = wide[index] - wide[query][:, None]
         normal = _smallest_eigenvector(*_covariance(offset, count))
-        normal[count < 3] = normal.new_tensor([0.0, 0.0, 1.0])
+        normal = torch.where((count < 3)[:, None], _up(normal), normal)
         normals[query] = _positive_last(normal).float()
     return normals
 
@@ -165,7 +165,12 @@ def _smallest_eigenvector(xx: Tensor, xy: Tensor, xz: Tensor, yy: Tensor, yz: Te
     clear_is_largest = half >= 0
     clear = _separate_eigenvector(matrix, torch.where(clear_is_largest, largest, smallest))
     normal = torch.where(clear_is_largest[:, None], _smallest_across(matrix, clear), clear)
-    return torch.where(is_isotropic[:, None], normal.new_tensor([0.0, 0.0, 1.0]), normal)
+    return torch.where(is_isotropic[:, None], _up(normal), normal)
+
+
+def _up(like: Tensor) -> Tensor:
+    """Return (0, 0, 1)."""
+    return torch.eye(3, dtype=like.dtype, device=like.device)[2]
 
 
 def _separate_eigenvector(matrix: Symmetric, value: Tensor) -> Tensor:

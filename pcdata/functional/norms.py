@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import REFERENCE, inner
+from pcdata.contracts.on_host import bounds_of
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.threads import at_once
 
@@ -77,7 +78,7 @@ def nearest_by_norm(
     """Look at every pair; rows of equal distance ascend."""
     index = torch.full((len(queries), k), len(points), dtype=torch.int64, device=points.device)
     distance = torch.full((len(queries), k), torch.inf, dtype=torch.float32, device=points.device)
-    for (start, stop), (first, last) in zip(pairwise(ptr.tolist()), pairwise(queries_ptr.tolist()), strict=True):
+    for (start, stop), (first, last) in zip(pairwise(bounds_of(ptr)), pairwise(bounds_of(queries_ptr)), strict=True):
         if start == stop:
             continue
         row = torch.arange(start, stop, dtype=torch.int64, device=points.device)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_count, checked_fraction, checked_length, checked_places
+from pcdata.contracts.on_host import bounds_of
 from pcdata.errors import NoPlaneError, UnitError
 from pcdata.functional.clusters import density_clusters
 from pcdata.functional.neighbors import nearest_rows
@@ -91,7 +92,7 @@ def segment_planes(
     label = torch.full((len(points),), -1, dtype=torch.int64, device=points.device)
     planes: list[Tensor] = []
     counts = []
-    for b, (start, stop) in enumerate(pairwise(ptr.tolist())):
+    for b, (start, stop) in enumerate(pairwise(bounds_of(ptr))):
         rest = torch.arange(start, stop, dtype=torch.int64, device=points.device)
         least, found = max(3, math.ceil(min_share * (stop - start))), 0
         while found < max_planes and len(rest) >= least:
@@ -198,7 +199,7 @@ def supporting_plane(
     assert viewpoint is None or isinstance(viewpoint, Tensor)
     search = {"distance": distance, "num_hypotheses": num_hypotheses, "max_tilt": max_tilt, "probability": probability}
     winners, samples = [], []
-    for b, (start, stop) in enumerate(pairwise(ptr.tolist())):
+    for b, (start, stop) in enumerate(pairwise(bounds_of(ptr))):
         own = points[start : stop : max(1, math.ceil((stop - start) / _SAMPLE))]
         span = max(float(along.max() - along.min()) for along in own.T.contiguous()) / distance
         if span > _MOST_SPAN:

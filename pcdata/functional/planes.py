@@ -13,6 +13,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import REFERENCE, inner, op
 from pcdata.contracts.host import differing
 from pcdata.contracts.numbers import checked_count, checked_fraction, checked_length
+from pcdata.contracts.on_host import bounds_of, counts_of
 from pcdata.errors import ConfigError, DTypeError, NoPlaneError, ShapeError
 from pcdata.functional.rows import count_per_cloud, counts_from_ptr, ptr_from_counts
 from pcdata.geometry.plane_fit import fit_plane, plane_distance, planes_through, through_origin
@@ -115,7 +116,7 @@ def record_planes(
 ) -> Tensor:  # (B, P) int64 on the CPU
     """Count the points near each plane that competes and has more than its cloud's floor and all before it; else 0."""
     counts = torch.zeros(competes.shape, dtype=torch.int64, device="cpu")
-    for b, (start, stop) in enumerate(pairwise(ptr.tolist())):
+    for b, (start, stop) in enumerate(pairwise(bounds_of(ptr))):
         counts[b, competes[b]] = _count_near(points[start:stop], planes[b, competes[b]], distance)
     before = torch.cat([floors[:, None], counts[:, :-1]], 1).cummax(1).values
     return counts.masked_fill_((counts <= before) | (counts <= floors[:, None]), 0)
@@ -132,7 +133,7 @@ def near_planes(
     backend: str = "auto",
 ) -> Tensor:  # (N,) bool
     """Mark the points that are near their cloud's plane, planes (B, 4); ``runs`` as bound_runs gives them."""
-    bounds = pairwise(ptr.tolist())
+    bounds = pairwise(bounds_of(ptr))
     near = [
         plane_distance(points[start:stop], plane[None])[0].abs_() < distance
         for (start, stop), plane in zip(bounds, planes)
@@ -144,7 +145,7 @@ def near_planes(
 def fit_planes(points: Tensor, ptr: Tensor, chosen: Tensor, *, backend: str = "auto") -> Tensor:  # (B, 4) on the CPU
     """Fit each cloud's plane to its chosen points (N,) bool; NaN where they lie on a line, as plane_of_moments."""
     none = torch.full((4,), torch.nan, dtype=torch.float64, device="cpu")
-    fitted = (fit_plane(points[start:stop][chosen[start:stop]]) for start, stop in pairwise(ptr.tolist()))
+    fitted = (fit_plane(points[start:stop][chosen[start:stop]]) for start, stop in pairwise(bounds_of(ptr)))
     return torch.stack([none if plane is None else plane for plane in fitted])
 
 
@@ -254,7 +255,7 @@ def ransac_plane(
     assert ptr is not None  # @op fills it
     assert isinstance(seed, list)  # and makes it one per cloud,
     assert up is None or isinstance(up, Tensor)  # and unit vectors
-    num_clouds, counts = len(ptr) - 1, counts_from_ptr(ptr).tolist()
+    num_clouds, counts = len(ptr) - 1, counts_of(ptr)
     # Hypotheses of many clouds at a time, so that memory does not grow with their number.
     at_once = max(1, _MOST_HYPOTHESES // num_hypotheses)
     winners = []

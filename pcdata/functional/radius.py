@@ -23,7 +23,7 @@ _MAX_CELLS_PER_AXIS = 2**36
 def squared_radius(radius: float | Tensor | None, device: torch.device) -> Tensor:
     """Return the () or (Q,) float32 that d2 of a neighbor is below; infinite when there is no radius."""
     if not isinstance(radius, Tensor):
-        radius = torch.tensor(math.inf if radius is None else radius, dtype=torch.float32, device=device)
+        radius = torch.full((), math.inf if radius is None else radius, dtype=torch.float32, device=device)
     return radius * radius
 
 

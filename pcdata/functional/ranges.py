@@ -15,9 +15,11 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_image_size
+from pcdata.contracts.on_host import read_together, uploaded
 from pcdata.errors import ConfigError
 from pcdata.functional.rendering import RenderedPoints, in_front
-from pcdata.functional.rows import cloud_of_rows
+from pcdata.functional.rows import cloud_of_rows, ptr_from_counts, rows_of_mask
+from pcdata.geometry.roots import square_root
 
 _NOWHERE = 2.0  # a border that no quotient reaches
 
@@ -52,9 +54,11 @@ def render_ranges(
     """
     assert ptr is not None
     beams, columns = size
-    row_borders, column_borders = (part.to(points.device) for part in pixel_borders("render_ranges", size, elevations))
+    row_borders, column_borders = (
+        uploaded(part, points.device) for part in pixel_borders("render_ranges", size, elevations)
+    )
     x, y, z = points.double().unbind(-1)
-    flat, distance = _root(x * x + y * y), _root((x * x + y * y) + z * z).float()
+    flat, distance = square_root(x * x + y * y), square_root((x * x + y * y) + z * z).float()
     row = torch.searchsorted(row_borders, -z / (flat + z.abs()), right=True) - 1
     across = x.abs() + y.abs()
     turn = torch.where(across > 0, x / across, 1.0)  # straight up is where straight ahead is
@@ -79,17 +83,20 @@ def deproject_ranges(
         CaptureError: a negative range.
         ConfigError: elevations that do not ascend within a quarter turn.
     """
-    views, beams, columns = ranges.shape
-    rows, turns = (part.to(ranges.device) for part in pixel_turns("deproject_ranges", (beams, columns), elevations))
+    beams, columns = ranges.shape[1:]
+    rows, turns = (
+        uploaded(part, ranges.device) for part in pixel_turns("deproject_ranges", (beams, columns), elevations)
+    )
     up, across = rows[:, None], turns.expand(beams, -1, -1)
     directions = torch.stack(
         [up[..., 0] * across[..., 0], up[..., 0] * across[..., 1], up[..., 1].expand(-1, columns)], dim=-1
     )
     valid = ranges > 0
-    points = (directions.expand(views, -1, -1, -1)[valid] * ranges[valid].double()[:, None]).float()
-    counts = valid.sum(dim=(1, 2))
-    ptr = torch.nn.functional.pad(counts.cumsum(0), (1, 0))
-    return points, ptr, valid.flatten(1).nonzero()[:, 1]
+    (counts,) = read_together([valid.sum(dim=(1, 2))])
+    rows = rows_of_mask(valid.flatten(), sum(counts))
+    pixel = rows % (beams * columns)
+    points = (directions.flatten(0, 1)[pixel] * ranges.flatten()[rows].double()[:, None]).float()
+    return points, ptr_from_counts(counts, ranges.device), pixel
 
 
 def pixel_borders(
@@ -125,11 +132,6 @@ def pixel_turns(
     azimuth = math.pi - (np.arange(columns) + 0.5) * (2 * math.pi / columns)
     rows, turns = (np.stack([np.cos(angle), np.sin(angle)], axis=1) for angle in (elevation, azimuth))
     return torch.from_numpy(rows), torch.from_numpy(turns)
-
-
-def _root(squared: Tensor) -> Tensor:
-    """Return the square root, correctly rounded: NumPy's is, torch's may be one unit off."""
-    return torch.from_numpy(np.sqrt(squared.cpu().numpy())).to(squared.device)
 
 
 def _checked_elevations(where: str, elevations: tuple[float, float]) -> tuple[float, float]:

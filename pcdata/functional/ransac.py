@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from pcdata.contracts.on_host import counts_of
 from pcdata.errors import NoShapeError
 from pcdata.functional.planes import draw_rows
 from pcdata.functional.rows import cloud_of_rows, count_per_cloud, counts_from_ptr, ptr_from_counts
@@ -141,7 +142,7 @@ def _winners(
 def count_near(family: Family, points: Tensor, ptr: Tensor, shapes: Tensor, distance: float) -> Tensor:  # (B, P) int64
     """Count the points of each cloud that are near its shapes (B, P, K); clouds of about one size go side by side."""
     counts = torch.zeros(shapes.shape[:2], dtype=torch.int64, device=points.device)
-    sizes, pairs = counts_from_ptr(ptr).tolist(), at_once(points.device, _PAIRS)
+    sizes, pairs = counts_of(ptr), at_once(points.device, _PAIRS)
     for bits in sorted({size.bit_length() for size in sizes}):
         clouds = [b for b, size in enumerate(sizes) if size.bit_length() == bits]
         widest = max(sizes[b] for b in clouds)

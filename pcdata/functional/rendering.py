@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_image_size, checked_positive
+from pcdata.contracts.on_host import uploaded
 from pcdata.functional.depth.deproject import pixel_rays, project_points, projected
 from pcdata.functional.rows import cloud_of_rows
 
@@ -214,7 +215,7 @@ class _Boxes(NamedTuple):
     @classmethod
     def about(cls, low: Tensor, high: Tensor, visible: Tensor, view: Tensor, size: tuple[int, int]) -> _Boxes:
         """Return the pixels with low <= center < high, each (N, 2), within the image of each box's view."""
-        most = torch.tensor([size[1], size[0]], dtype=torch.float64, device=low.device)
+        most = uploaded(torch.tensor([size[1], size[0]], dtype=torch.float64, device="cpu"), low.device)
         left, top = low.ceil().clamp(min=0).minimum(most).long().unbind(-1)
         right, bottom = high.ceil().clamp(min=0).minimum(most).long().unbind(-1)
         return cls((view * size[0] + top) * size[1] + left, (right - left) * visible, (bottom - top) * visible, size[1])

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
 from pcdata.contracts.host import all_finite
+from pcdata.contracts.on_host import bounds_of, uploaded
 from pcdata.geometry.rigid import from_rotation_translation
 
 # Up to here a look at each cloud by itself costs less than running totals of all rows.
@@ -28,23 +29,21 @@ def counts_from_ptr(ptr: Tensor) -> Tensor:
     return ptr[1:] - ptr[:-1]
 
 
-def listed_counts(ptr: Tensor) -> list[int]:
-    """Return the number of rows of every cloud as a list."""
-    return [stop - start for start, stop in pairwise(ptr.tolist())]
-
-
 def ptr_from_counts(counts: Tensor | Iterable[int], device: torch.device | None = None) -> Tensor:
     """Return (B+1,) row pointers for (B,) counts."""
     if not isinstance(counts, Tensor):
-        counts = torch.tensor(list(counts), dtype=torch.int64, device="cpu" if device is None else device)
-    counts = counts.to(dtype=torch.int64, device=device)
-    return torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        counts = torch.tensor(list(counts), dtype=torch.int64, device="cpu")
+    counts = counts.to(dtype=torch.int64)
+    ptr = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+    return ptr if device is None or ptr.device.type != "cpu" else uploaded(ptr, device)
 
 
 def cloud_of_rows(ptr: Tensor) -> Tensor:
     """Return (N,) int64: the cloud that each row belongs to."""
     counts = counts_from_ptr(ptr)
-    return torch.repeat_interleave(torch.arange(len(counts), dtype=torch.int64, device=ptr.device), counts)
+    clouds = torch.arange(len(counts), dtype=torch.int64, device=ptr.device)
+    bounds = bounds_of(ptr)
+    return torch.repeat_interleave(clouds, counts, output_size=bounds[-1] - bounds[0])
 
 
 def ptr_after_mask(mask: Tensor, ptr: Tensor) -> Tensor:
@@ -61,10 +60,18 @@ def count_per_cloud(mask: Tensor, ptr: Tensor) -> Tensor:
     """Return the (B,) number of true rows of every cloud for a (N,) bool mask."""
     if mask.device.type == "cpu" and len(ptr) <= _FEW_CLOUDS:
         flags = mask.numpy()
-        counts = [np.count_nonzero(flags[start:stop]) for start, stop in pairwise(ptr.tolist())]
+        counts = [np.count_nonzero(flags[start:stop]) for start, stop in pairwise(bounds_of(ptr))]
         return torch.tensor(counts, dtype=torch.int64, device="cpu")
     before = torch.cat([mask.new_zeros(1, dtype=torch.int64), mask.cumsum(0)])
     return counts_from_ptr(before[ptr])
+
+
+def rows_of_mask(mask: Tensor, count: int) -> Tensor:
+    """Return the (count,) int64 rows where a (N,) mask of so many true values is true; the host waits for nothing."""
+    if mask.device.type == "cpu":
+        return mask.nonzero().squeeze(1)
+    ranks = torch.arange(1, count + 1, dtype=torch.int64, device=mask.device)
+    return torch.searchsorted(mask.cumsum(0), ranks)
 
 
 @inner
@@ -101,7 +108,7 @@ def first_per_cloud(mask: Tensor, ptr: Tensor) -> Tensor:
     """Return the (B,) first true row of every cloud for a (N,) bool mask; its first row where none is true."""
     if mask.device.type == "cpu" and len(ptr) <= _FEW_CLOUDS:
         flags = mask.numpy()
-        first = [start + int(flags[start:stop].argmax()) for start, stop in pairwise(ptr.tolist())]
+        first = [start + int(flags[start:stop].argmax()) for start, stop in pairwise(bounds_of(ptr))]
         return torch.tensor(first, dtype=torch.int64, device="cpu")
     rows = mask.nonzero().squeeze(1)
     place = torch.searchsorted(rows, ptr[:-1])
@@ -137,7 +144,7 @@ def segment_min(values: Tensor, ptr: Tensor) -> Tensor:
 def _segment_extreme(values: Tensor, ptr: Tensor, reduce: str, empty: float) -> Tensor:
     found = torch.full((len(ptr) - 1, *values.shape[1:]), empty, dtype=values.dtype, device=values.device)
     if len(ptr) <= _FEW_CLOUDS:  # each at the speed of memory
-        for cloud, (start, stop) in enumerate(pairwise(ptr.tolist())):
+        for cloud, (start, stop) in enumerate(pairwise(bounds_of(ptr))):
             if stop > start:  # by index: autograd takes no change of rows that iteration gave
                 found[cloud] = values[start:stop].amax(0) if reduce == "amax" else values[start:stop].amin(0)
         return found
@@ -147,7 +154,9 @@ def _segment_extreme(values: Tensor, ptr: Tensor, reduce: str, empty: float) -> 
 
 def group_count(group: Tensor, num_groups: int) -> Tensor:
     """Return the (G,) int64 number of rows in each group."""
-    return torch.bincount(group, minlength=num_groups)
+    if group.device.type == "cpu":
+        return torch.bincount(group, minlength=num_groups)
+    return group.new_zeros(num_groups).index_add_(0, group, torch.ones_like(group))  # bincount waits for the maximum
 
 
 def group_first(group: Tensor, num_groups: int) -> Tensor:
@@ -194,4 +203,7 @@ def inside_box(points: Tensor, lower: Sequence[float], upper: Sequence[float]) -
     """Return a (N,) bool mask of the (N, 3) points with lower <= point <= upper; None if one is NaN or infinite."""
     if not all_finite(points):  # a comparison would leave them out without a word
         return None
-    return ((points >= points.new_tensor(lower)) & (points <= points.new_tensor(upper))).all(dim=1)
+    low, high = (
+        uploaded(torch.tensor(corner, dtype=points.dtype, device="cpu"), points.device) for corner in (lower, upper)
+    )
+    return ((points >= low) & (points <= high)).all(dim=1)

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_counts, checked_fraction, counts_per_cloud, require_rows
+from pcdata.contracts.on_host import bounds_of, counts_of, on_host, uploaded
 from pcdata.errors import ConfigError, OutOfRangeError, ShapeError
 from pcdata.functional.neighbors import knn
 from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_from_counts, segment_sum
@@ -25,15 +26,17 @@ def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int], *, backend: st
 
     Clouds of about one size are sampled side by side.
     """
-    sizes = counts_from_ptr(ptr).tolist()
+    sizes = counts_of(ptr)
     picked = torch.empty(sum(counts), dtype=torch.int64, device=points.device)
+    bounds = bounds_of(ptr)
     picked_ptr = ptr_from_counts(counts).tolist()
     for length in sorted({size.bit_length() for size in sizes}):
         clouds = [b for b, size in enumerate(sizes) if size.bit_length() == length and counts[b]]
         if not clouds:
             continue
         most = max(counts[b] for b in clouds)
-        rows = _farthest_side_by_side(points, ptr[clouds], ptr[[b + 1 for b in clouds]], most)
+        begin, end = (torch.tensor([bounds[b + k] for b in clouds], dtype=torch.int64, device="cpu") for k in (0, 1))
+        rows = _farthest_side_by_side(points, begin, end, most)
         for b, own in zip(clouds, rows):
             picked[picked_ptr[b] : picked_ptr[b + 1]] = own[: counts[b]]
     return picked
@@ -42,7 +45,7 @@ def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int], *, backend: st
 def checked_ratio(where: str, name: str, arguments: Mapping[str, Any]) -> list[int]:
     """Require a number above 0 and at most 1; bodies get the counts, ceil(ratio * n) in float32 as torch-cluster."""
     ratio = torch.tensor(checked_fraction(where, name, arguments), dtype=torch.float32, device="cpu")
-    return (counts_from_ptr(arguments["ptr"]).cpu().float() * ratio).ceil().long().tolist()
+    return (counts_from_ptr(on_host(arguments["ptr"])).float() * ratio).ceil().long().tolist()
 
 
 def _wanted_counts(where: str, num_samples: Any, ratio: Any) -> list[int]:
@@ -116,8 +119,9 @@ def farthest_point_sample(
     is_first = torch.ones_like(order, dtype=torch.bool)  # of its label
     is_first[1:] = (labels[order].diff() != 0) | (owner[order].diff() != 0)
     first = is_first.nonzero().squeeze(1)
-    sizes = torch.diff(first, append=first.new_tensor([len(order)]))
-    shares = _equal_shares(sizes, owner[order[first]], torch.tensor(counts, dtype=torch.int64, device=ptr.device))
+    sizes = torch.diff(first, append=torch.full((1,), len(order), dtype=first.dtype, device=first.device))
+    wanted = uploaded(torch.tensor(counts, dtype=torch.int64, device="cpu"), ptr.device)
+    shares = _equal_shares(sizes, owner[order[first]], wanted)
     picked = order[farthest_rows(points[order], ptr_from_counts(sizes), shares.tolist(), backend=backend)]
     turn = (
         torch.arange(len(picked), dtype=torch.int64, device=ptr.device)
@@ -197,12 +201,12 @@ def random_sample_index(
     require_rows("random_sample_index", [min(k, 1) for k in wanted] if replace else wanted, ptr)
     if len(seeds) != len(wanted):
         raise ShapeError(f"random_sample_index: {len(seeds)} seeds were given for {len(wanted)} clouds")
-    starts = ptr.tolist()
+    starts = bounds_of(ptr)
     drawn = [
         start + _draw(stop - start, k, seed, replace)
         for start, stop, k, seed in zip(starts, starts[1:], wanted, seeds.tolist())
     ]
-    return torch.cat(drawn).to(ptr.device), ptr_from_counts(wanted, device=ptr.device)
+    return uploaded(torch.cat(drawn), ptr.device), ptr_from_counts(wanted, device=ptr.device)
 
 
 def _rows_from_start(where: str, ptr: Tensor, start: Tensor | None, seeds: Tensor | None) -> Tensor | None:
@@ -216,11 +220,12 @@ def _rows_from_start(where: str, ptr: Tensor, start: Tensor | None, seeds: Tenso
         )
     if start is None:
         return None
-    for cloud in ((start < 0) | (start >= sizes.clamp(min=1))).nonzero().squeeze(1).tolist():
-        raise OutOfRangeError(
-            f"{where}: start {int(start[cloud])} is no row of cloud {cloud}, which has {int(sizes[cloud])}; "
-            "rows are counted within each cloud, from 0"
-        )
+    for number, (first, size) in enumerate(zip(on_host(start).tolist() if seeds is None else (), counts_of(ptr))):
+        if not 0 <= first < max(1, size):
+            raise OutOfRangeError(
+                f"{where}: start {first} is no row of cloud {number}, which has {size}; "
+                "rows are counted within each cloud, from 0"
+            )
     cloud = cloud_of_rows(ptr)
     row = torch.arange(len(cloud), dtype=torch.int64, device=ptr.device) - ptr[cloud]
     own = start[cloud]
@@ -230,7 +235,7 @@ def _rows_from_start(where: str, ptr: Tensor, start: Tensor | None, seeds: Tenso
 
 def _equal_shares(sizes: Tensor, owner: Tensor, counts: Tensor) -> Tensor:
     """Share the (B,) counts of clouds among their groups of (G,) sizes, as equally as the sizes allow: (G,) int64."""
-    groups_ptr = ptr_from_counts(torch.bincount(owner, minlength=len(counts)))
+    groups_ptr = ptr_from_counts(torch.zeros_like(counts).index_add_(0, owner, torch.ones_like(owner)))
 
     def taken(level: Tensor) -> Tensor:  # of each cloud, with at most so many from each of its groups
         return segment_sum(torch.minimum(sizes, level[owner]), groups_ptr)
@@ -254,6 +259,7 @@ def _farthest_side_by_side(points: Tensor, begin: Tensor, end: Tensor, count: in
     thirty times faster than their positions. Returns (b, count) rows; those beyond a cloud's size mean nothing.
     """
     num, longest = len(begin), int((end - begin).max())
+    begin, end = uploaded(begin, points.device), uploaded(end, points.device)
     width = min(_TILE, longest)
     length = -(-longest // width) * width
     place = torch.arange(length, dtype=torch.int64, device=points.device)

@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
-from pcdata.contracts.numbers import checked_places
+from pcdata.contracts.numbers import checked_places, numbers_on_host
+from pcdata.contracts.on_host import on_host, uploaded
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional.rows import cloud_of_rows, group_first
@@ -50,7 +51,7 @@ def box_mask(
 
 def require_box(lower: Tensor, upper: Tensor) -> None:
     """Require corners (B, 3) of which the lower is below the upper on every axis."""
-    for b in (lower >= upper).any(1).nonzero().squeeze(1).tolist():
+    for b in (on_host(lower) >= on_host(upper)).any(1).nonzero().squeeze(1).tolist():
         raise ConfigError(
             f"box_mask: lower must be below upper on every axis, cloud {b} has {lower[b].tolist()}, {upper[b].tolist()}"
         )
@@ -58,12 +59,12 @@ def require_box(lower: Tensor, upper: Tensor) -> None:
 
 def checked_polygon(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
     """Require at least three corners (P, 2), finite; bodies get (P, 2) float64."""
-    corners = torch.as_tensor(arguments[name], dtype=torch.float64, device=arguments["points"].device).detach()
+    corners = numbers_on_host(arguments[name])
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
         raise ShapeError(f"{where}: {name} must be the corners (P, 2), three or more, got {tuple(corners.shape)}")
     if not bool(torch.isfinite(corners).all()):
         raise ConfigError(f"{where}: {name} must be finite, got {corners.tolist()}")
-    return corners
+    return uploaded(corners, arguments["points"].device)
 
 
 @op(points="N 2", polygon=checked_polygon, gradient=False)

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
+from pcdata.contracts.on_host import bounds_of
 
 ALIGNED = 64  # bytes: a line of the processor's cache
 
@@ -161,7 +162,7 @@ def gather_kept(
     copied = {}
     for name, room in rooms.items():
         to, row_bytes, end = room.numpy().reshape(-1).view(np.uint8), room.nbytes // max(1, len(room)), 0
-        for address, (start, stop) in zip(sources[name].tolist(), pairwise(ptr.tolist())):
+        for address, (start, stop) in zip(sources[name].tolist(), pairwise(bounds_of(ptr))):
             if stop == start:
                 continue
             rows = np.array((ctypes.c_uint8 * ((stop - start) * row_bytes)).from_address(address))

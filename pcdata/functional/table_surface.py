@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_length, checked_positive
+from pcdata.contracts.on_host import bounds_of, counts_of
 from pcdata.errors import ConfigError, NoPlaneError, ShapeError
 from pcdata.functional.clusters import dbscan
 from pcdata.functional.enclosed import enclosed_points
@@ -19,7 +20,7 @@ from pcdata.functional.image_clusters import linked_pixels
 from pcdata.functional.image_grid import ImageGrid, checked_grid, is_lined
 from pcdata.functional.neighbors import knn
 from pcdata.functional.planes import fit_planes
-from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, pick_rows, ptr_after_mask
+from pcdata.functional.rows import cloud_of_rows, pick_rows, ptr_after_mask
 from pcdata.functional.surface_fit import fit_surface, reaches
 
 # Of the distance: what makers of depth cameras allow theirs within its range, and more than the good ones have.
@@ -73,14 +74,14 @@ def window_medians(
         return torch.cat(
             [
                 values[start:stop][knn(points[start:stop], k=min(_WINDOW, stop - start))[0]].median(1).values
-                for start, stop in pairwise(ptr.tolist())
+                for start, stop in pairwise(bounds_of(ptr))
                 if stop > start
             ]
             or [values]
         )
     height, width = grid.size
     medians = []
-    for start, stop in pairwise(ptr.tolist()):
+    for start, stop in pairwise(bounds_of(ptr)):
         pixel = grid.pixel_index[start:stop]
         image = torch.full((height + 2, width + 2), torch.nan, dtype=values.dtype, device=values.device)
         row, column = pixel // width + 1, pixel % width + 1
@@ -229,7 +230,7 @@ def table_surface(
 
 
 def _bounds(ptr: Tensor) -> list[tuple[int, int]]:
-    return list(pairwise(ptr.tolist()))
+    return list(pairwise(bounds_of(ptr)))
 
 
 def point_areas(points: Tensor, ptr: Tensor, grid: ImageGrid | None) -> Tensor:  # (N,) float64
@@ -312,4 +313,4 @@ def _connected(
 
 
 def _sizes(ptr: Tensor) -> list[int]:
-    return [int(one) for one in counts_from_ptr(ptr).tolist()]
+    return [int(one) for one in counts_of(ptr)]

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_image_size, checked_places, checked_positive
+from pcdata.contracts.on_host import bounds_of
 from pcdata.errors import ConfigError
 from pcdata.functional.depth.deproject import projected
 from pcdata.functional.hulls import hull_surface
@@ -109,7 +110,7 @@ def hidden_point_mask(
     if radius_factor < 1:
         raise ConfigError(f"hidden_point_mask: radius_factor must be 1 or more, got {radius_factor}")
     group, number = numbered_rows(points, ptr)  # equal points of a cloud
-    bounds, eyes = ptr.tolist(), viewpoint.double().cpu().numpy()
+    bounds, eyes = bounds_of(ptr), viewpoint.double().cpu().numpy()
     rows, groups = points.detach().double().cpu().numpy(), group.cpu().numpy()
     visible = np.zeros(number, dtype=np.bool_)
     for eye, start, stop in zip(eyes, bounds[:-1], bounds[1:], strict=True):

@@ -10,12 +10,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_edges, checked_places
+from pcdata.contracts.on_host import read_together
 from pcdata.errors import ConfigError, DTypeError, TooFewPointsError, UnitError
 from pcdata.functional.rows import (
     cloud_of_rows,
@@ -28,6 +28,7 @@ from pcdata.functional.rows import (
     segment_max,
     segment_min,
 )
+from pcdata.geometry.roots import square_root
 
 # Offsets inside a voxel are summed as integers of 2^-31 voxel: exact and so independent of order, threads and device.
 # A sum fits 63 bits for up to 2^32 points.
@@ -162,7 +163,7 @@ def find_voxel_size(
         too_large = torch.where(open_, enough, too_large)
         enough = torch.where(open_, enough / 2, enough)
     while bool((open_ := (count > num_points) & (too_large > enough * (1 + SIZE_TOLERANCE))).any()):
-        middle = _square_root(enough * too_large)
+        middle = square_root(enough * too_large)
         found = count.clone()
         found[open_] = _count_voxels(points, ptr, middle, open_)
         leaves_enough = open_ & (found >= num_points)
@@ -294,11 +295,6 @@ def _extreme(values: Tensor, inverse: Tensor, num_voxels: int, reduce: str) -> T
     return found.scatter_reduce(0, inverse, wide, reduce, include_self=False).to(values.dtype)
 
 
-def _square_root(values: Tensor) -> Tensor:
-    """Return float64 square roots, correctly rounded: torch's own may be one unit off."""
-    return torch.from_numpy(np.sqrt(values.cpu().numpy())).to(values.device)
-
-
 def _count_voxels(points: Tensor, ptr: Tensor, sizes: Tensor, open_: Tensor) -> Tensor:
     """Return how many points :func:`voxel_downsample` leaves of each open cloud, for (B,) sizes, open_ (B,) bool."""
     if not bool(open_.all()):
@@ -355,8 +351,9 @@ def _scale_to_grid(
 def voxel_keys(cloud: Tensor, voxel: Tensor, num_clouds: int) -> Tensor:
     """Number the pairs of cloud (N,) and voxel (N, 3, not negative) by (N,) int64 keys that never collide."""
     key, size = cloud, num_clouds
-    for axis in voxel.long().unbind(1):
-        axis_size = int(axis.max()) + 1 if len(axis) else 1
+    (largest,) = read_together([voxel.amax(0)]) if len(voxel) else ([0, 0, 0],)
+    for axis, most in zip(voxel.long().unbind(1), largest):
+        axis_size = most + 1
         if size * axis_size >= 2**63:
             # Ranks are below N, so the product of two of them fits.
             key, size = _rank(key)

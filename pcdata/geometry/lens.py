@@ -24,6 +24,7 @@ from pcdata.contracts.dispatch import inner
 from pcdata.errors import ShapeError
 from pcdata.geometry.lens_models import LENS_MODELS, ROW, WIDEST_PLAIN, check_distortion, lens_facts
 from pcdata.geometry.radial_lenses import bend_radially, radial_fold, unbend_radially
+from pcdata.geometry.roots import square_root
 from pcdata.threads import at_once
 
 # Normalized units. With a focal length of 1000 pixels this is 1e-9 pixel, far below what float32 rays can hold.
@@ -291,8 +292,8 @@ def _newton_step(
 
 
 def _onto(edge: float, x: Tensor, y: Tensor, squared: Tensor) -> tuple[Tensor, Tensor]:
-    """Bring coordinates back to a radius; NumPy's root is correctly rounded, torch's may be one unit off."""
-    shrink = edge / torch.from_numpy(np.sqrt(squared.cpu().numpy())).to(x.device)
+    """Bring coordinates back to a radius."""
+    shrink = edge / square_root(squared)
     return x * shrink, y * shrink
 
 

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pcdata.contracts.on_host import on_host
 from pcdata.errors import PoseError, ShapeError
 from pcdata.geometry.rotations import rotation_from_unit_quaternion
 
@@ -78,7 +79,7 @@ def check_rigid(where: str, pose: Tensor, *, tolerance: float = 1e-3) -> None:
         raise ShapeError(f"{where}: a pose must be (..., 4, 4), got {tuple(pose.shape)}")
     if pose.ndim == 3 and are_few_and_rigid(pose, tolerance=tolerance):
         return
-    flat = pose.detach().double().reshape(-1, 4, 4)
+    flat = on_host(pose).double().reshape(-1, 4, 4)
     rotation, last = flat[:, :3, :3], flat[:, 3]
     eye = torch.eye(4, dtype=torch.float64, device=flat.device)
     error = (rotation @ rotation.mT - eye[:3, :3]).abs().amax((1, 2))
@@ -131,7 +132,7 @@ def check_affine(where: str, matrix: Tensor) -> None:
     """
     if len(matrix) > _FEW and _is_plain(matrix) and _all_affine(matrix.numpy()):
         return
-    rows = matrix.detach().tolist()
+    rows = on_host(matrix).tolist()
     for index, ((a, b, c, _), (d, e, f, _), (g, h, i, _), last) in enumerate(rows):
         name = f"{where}: matrix {index}" if len(rows) > 1 else f"{where}: the matrix"
         if not math.isfinite(sum(map(sum, rows[index]))):

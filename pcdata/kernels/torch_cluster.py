@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import kernel
+from pcdata.contracts.on_host import bounds_of
 from pcdata.errors import BackendError
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
@@ -42,7 +43,7 @@ def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
         BackendError: on CUDA, or when torch-cluster repeated a point (it does once only duplicates are left).
     """
     _require_cpu("farthest_point_sample", points)
-    starts = ptr.tolist()
+    starts = bounds_of(ptr)
     picked = [
         start + _sample_cloud(points[start:stop], count, cloud)
         for cloud, (start, stop, count) in enumerate(zip(starts, starts[1:], counts, strict=False))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,8 +12,9 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from pcdata.contracts.host import any_above, any_negative
-from pcdata.contracts.known import FINITE, NOT_NEGATIVE, is_known, note
-from pcdata.contracts.lengths import check_depth
+from pcdata.contracts.known import FINITE, METRES, NOT_NEGATIVE, is_known, note, pass_on
+from pcdata.contracts.lengths import FARTHEST, check_depth
+from pcdata.contracts.on_host import look
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, FrameError, ShapeError
 from pcdata.functional.depth.deproject import mask_depth
@@ -72,6 +73,8 @@ class DepthFrame(Structure):
 
     def __post_init__(self) -> None:
         where = f"DepthFrame {self.sample_id!r}" if self.sample_id else "DepthFrame"
+        if isinstance(self.depth, Tensor) and self.depth.dtype is torch.float32:
+            _look_once(self.depth)
         check_tensors(
             where,
             {
@@ -98,9 +101,10 @@ class DepthFrame(Structure):
         )
         if any_negative(self.depth):
             raise CaptureError(f"{where}: depth has negative values; 0 is the only mark for 'no reading'")
-        # Some thousand pixels tell the median; on a GPU they are one small copy.
-        some = self.depth.flatten()[:: max(1, self.depth.numel() // _SAMPLE)].detach().cpu().numpy()
-        check_depth(where, some[some > 0])
+        if not is_known(METRES, self.depth):
+            some = _sample_of(self.depth).cpu().numpy()
+            check_depth(where, some[some > 0])
+            note(METRES, self.depth)
         if self.confidence is not None and any_above(self.confidence, int(max(Confidence))):
             raise CaptureError(
                 f"{where}: confidence must hold the values of Confidence, 0 .. {max(Confidence)}, got "
@@ -203,6 +207,13 @@ class DepthFrame(Structure):
         """Where the depth lies."""
         return self.depth.device
 
+    def _mapped(self, move: Callable[[Tensor], Tensor]) -> DepthFrame:
+        moved = super()._mapped(move)
+        if moved.device != self.device:
+            for fact in (FINITE, NOT_NEGATIVE, METRES):  # the constructor has looked
+                note(fact, moved.depth)
+        return moved
+
     def view(self, index: int) -> DepthFrame:
         """Return one view as a frame of its own.
 
@@ -218,8 +229,9 @@ class DepthFrame(Structure):
         """Return the frame with "no reading" wherever depth is not in [near, far] or ``mask`` (V, H, W) is False."""
         check_tensors("DepthFrame.masked", {"depth": self.depth, "mask": mask}, _MASKED, check_values=False)
         depth = mask_depth(self.depth, near, far, mask)
+        pass_on(self.depth, depth)
         note(NOT_NEGATIVE, depth)  # what is NaN or below 0 is no reading
-        if far is not None or is_known(FINITE, self.depth):
+        if far is not None:
             note(FINITE, depth)
         return derived(self, depth=depth)
 
@@ -291,6 +303,26 @@ class DepthFrame(Structure):
         carried = [name for name, tensor in self._tensors().items() if tensor is not None]
         told = told_signals(self.recorded_signals)
         return f"DepthFrame({self.sample_id!r}, {self.num_views} views of {width}x{height}: {', '.join(carried)}{told})"
+
+
+def _sample_of(depth: Tensor) -> Tensor:
+    """Return some thousand pixels: they tell the median."""
+    return depth.detach().flatten()[:: max(1, depth.numel() // _SAMPLE)]
+
+
+def _look_once(depth: Tensor) -> None:
+    """Wait once for all that is to be known of depth on another device."""
+
+    def looks_like_metres() -> Tensor:
+        some = _sample_of(depth)
+        return (some > FARTHEST).sum() * 2 < (some > 0).sum()
+
+    answers: dict[Hashable, Callable[[], Tensor]] = {
+        FINITE: lambda: torch.isfinite(depth).all(),
+        NOT_NEGATIVE: lambda: ~(depth < 0).any(),
+        METRES: looks_like_metres,
+    }
+    look(depth, answers)
 
 
 def signals_of_views(frames: Sequence[DepthFrame]) -> dict[str, Any]:

@@ -9,6 +9,8 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
+from pcdata.contracts.known import is_known, note
+from pcdata.functional.image_grid import pixels_rise
 from pcdata.structures.structure import Structure
 
 _FEWEST = 100  # points that tell a camera: four numbers are fitted
@@ -58,13 +60,24 @@ def seen_through_pinhole(
     return ImageLayout(size=size, intrinsics=intrinsics)
 
 
-def within_image(source_index: Tensor, ptr: Tensor, num_pixels: int) -> Tensor:
+def within_image(source_index: Tensor, ptr: Tensor, size: tuple[int, int]) -> Tensor:
     """Number pixels within their own image. Rows are in pixel order, so a cloud's last one tells whether they are."""
+    num_pixels, rises = size[0] * size[1], pixels_rise(size)
     if source_index.device.type == "cpu":  # elsewhere reading them would wait for the device
         rows = source_index.numpy()
         if all(rows[stop - 1] < num_pixels for start, stop in pairwise(ptr.tolist()) if stop > start):
             return source_index
-    return source_index % num_pixels
+    elif is_known(rises, source_index, ptr):
+        return source_index
+    within = source_index % num_pixels
+    if is_known(pixels_of_views(size), source_index, ptr):
+        note(rises, within, ptr)
+    return within
+
+
+def pixels_of_views(size: tuple[int, int]) -> tuple[str, int, int]:
+    """Name the fact that source indices, with row pointers, are of pixels of images of this size, in their order."""
+    return ("pixels of views", *size)
 
 
 def joined_layout(layouts: Sequence[ImageLayout | None], clouds: slice = slice(None)) -> ImageLayout | None:

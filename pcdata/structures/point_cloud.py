@@ -12,16 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from pcdata.contracts.known import FINITE, is_known, note
+from pcdata.contracts.on_host import bounds_of, counts_of, hold, read_together, uploaded
 from pcdata.contracts.tensors import check_ptr_values, check_tensors
 from pcdata.errors import DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid, pixels_rise
 from pcdata.functional.motions import are_plain_motions
-from pcdata.functional.rows import cloud_of_rows, join_rows, listed_counts, pad_rows, pick_rows, ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, join_rows, pad_rows, pick_rows, ptr_from_counts, rows_of_mask
 from pcdata.geometry.rigid import check_affine
 from pcdata.structures.cloud_batch import CloudBatch, joined_facts
 from pcdata.structures.cloud_checks import check_cloud, check_fields, check_motions
 from pcdata.structures.cloud_summary import cloud_summary
-from pcdata.structures.image_layout import within_image
+from pcdata.structures.image_layout import pixels_of_views, within_image
 from pcdata.structures.joining import joinable_parts, rows_per_cloud
 from pcdata.structures.kinds import FIELDS, METRE, Kind, attributes, averaged, fillers, moved, present_fields
 from pcdata.structures.padded import PaddedClouds, padded_clouds
@@ -78,14 +79,11 @@ class PointCloud(CloudBatch):
             found = type(given["points"]).__name__
             raise DTypeError(f"PointCloud: points must be a torch.Tensor, float32 (N, 3), not {found}")
         if given["ptr"] is None:
-            fill(self, "ptr", torch.tensor([0, len(self.points)], dtype=torch.int64, device=self.points.device))
+            fill(self, "ptr", ptr_from_counts([len(self.points)], self.points.device))
         num_clouds = len(self.ptr) - 1
         if given["source_from_cloud"] is None:
-            fill(
-                self,
-                "source_from_cloud",
-                torch.eye(4, dtype=torch.float64, device="cpu").repeat(num_clouds, 1, 1).to(self.device),
-            )
+            identity = torch.eye(4, dtype=torch.float64, device="cpu").repeat(num_clouds, 1, 1)
+            fill(self, "source_from_cloud", uploaded(identity, self.device))
         fill(self, "source_frame", self.source_frame or self.frame_id)
         if not isinstance(given["meta"], Metas):
             fill(self, "meta", tuple(given["meta"]) or tuple([{} for _ in range(num_clouds)]))
@@ -161,9 +159,8 @@ class PointCloud(CloudBatch):
         """Where the points sit in their depth images, for the operations' ``grid=``; None once they left them."""
         if self.layout is None or self.source_index is None:
             return None
-        height, width = self.layout.size
         return ImageGrid(
-            within_image(self.source_index, self.ptr, height * width),
+            within_image(self.source_index, self.ptr, self.layout.size),
             self.layout.size,
             self.layout.intrinsics,
             self.source_from_cloud,
@@ -230,19 +227,23 @@ class PointCloud(CloudBatch):
         Raises:
             ShapeError: ptr (B+1,) int64 does not cut the M rows into B clouds.
         """
+        is_mask = index.dtype is torch.bool
+        if is_mask and self.device.type != "cpu" and index.shape == (self.num_points,):
+            (count,), bounds = read_together([index.sum(), ptr])
+            hold(ptr, torch.tensor(bounds, dtype=ptr.dtype, device="cpu"))
+            index = rows_of_mask(index, count)
         rows = pick_rows(self.fields(), index)
         sizes = check_tensors("PointCloud", {**rows, "ptr": ptr}, _SELECTED, check_values=False)
         if sizes["B"] != self.num_clouds:
             raise ShapeError(f"PointCloud.select: ptr cuts {sizes['B']} clouds out of {self.num_clouds}")
-        if ptr.device.type == "cpu":
-            check_ptr_values("PointCloud", "ptr", ptr, sizes["N"])
-        layout = self.layout if index.dtype is torch.bool else None
+        check_ptr_values("PointCloud", "ptr", ptr, sizes["N"])
+        layout = self.layout if is_mask else None
         if is_known(FINITE, self.points):
             note(FINITE, rows["points"])
         if layout is not None and "source_index" in rows:
-            rises = pixels_rise(layout.size)
-            if is_known(rises, vars(self)["source_index"], self.ptr):
-                note(rises, rows["source_index"], ptr)
+            for fact in (pixels_rise(layout.size), pixels_of_views(layout.size)):
+                if is_known(fact, vars(self)["source_index"], self.ptr):
+                    note(fact, rows["source_index"], ptr)
         return self._with_rows(rows, ptr=ptr, layout=layout)
 
     def _with_rows(self, rows: Mapping[str, Tensor], **others: Any) -> PointCloud:
@@ -340,10 +341,10 @@ class PointCloud(CloudBatch):
 
     def __getitem__(self, which: int | slice) -> PointCloud:
         """Return one cloud of the batch, or a slice of it; the memory is shared."""
-        return self._slice(self._which(which), self.ptr.tolist())
+        return self._slice(self._which(which), bounds_of(self.ptr))
 
     def __iter__(self) -> Iterator[PointCloud]:
-        bounds = self.ptr.tolist()
+        bounds = bounds_of(self.ptr)
         return (self._slice(slice(b, b + 1), bounds) for b in range(self.num_clouds))
 
     def unbatch(self) -> list[PointCloud]:
@@ -396,7 +397,7 @@ class PointCloud(CloudBatch):
         Raises:
             ShapeError: a cloud is longer than ``num_points``.
         """
-        counts = listed_counts(self.ptr)
+        counts = counts_of(self.ptr)
         if self.num_points == 0 or {*counts} != {counts[0] if num_points is None else num_points}:
             return self.cat_padded([self], num_points)
         shape = len(counts), counts[0]
@@ -415,7 +416,7 @@ class PointCloud(CloudBatch):
             if len(clouds) == 1:
                 return clouds[0].padded(num_points)
         parts = joinable_parts(clouds, [cloud.fields() for cloud in clouds])
-        counts = [listed_counts(cloud.ptr) for cloud in clouds]
+        counts = [counts_of(cloud.ptr) for cloud in clouds]
         flat = list(itertools.chain.from_iterable(counts))
         width = max(flat) if num_points is None else num_points
         if max(flat) > width:
@@ -438,7 +439,7 @@ class PointCloud(CloudBatch):
         return shown_page([("cloud", self)], repr(self), max_points=max_points, grasps=grasps)
 
     def __repr__(self) -> str:
-        counts = self.counts.tolist()
+        counts = counts_of(self.ptr)
         sizes = f"{counts[0]} points" if len(counts) == 1 else f"{len(counts)} clouds of {min(counts)}-{max(counts)}"
         carried = ", ".join(name for name in self.fields() if name != "points")
         carried = f"{': ' + carried if carried else ''}{told_signals(self.recorded_signals)}"

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from pcdata.contracts.on_host import SMALL, hold
 from pcdata.errors import DTypeError
 
 S = TypeVar("S")
@@ -52,7 +53,14 @@ class Structure:
                 f"{type(self).__name__}.to: takes a device, got {given!r:.100}; of another dtype is the tensor that a "
                 "network is fed, batch.points.to(device, dtype)"
             )
-        return self._mapped(lambda tensor: tensor.to(device, non_blocking=non_blocking))
+
+        def move(tensor: Tensor) -> Tensor:
+            moved = tensor.to(device, non_blocking=non_blocking)
+            if tensor.device.type == "cpu" != moved.device.type and tensor.numel() <= SMALL:
+                hold(moved, tensor.detach().clone())
+            return moved
+
+        return self._mapped(move)
 
     def cuda(self: Movable, device: torch.device | str | int | None = None, *, non_blocking: bool = False) -> Movable:
         """Move all tensors to a CUDA device; None = the current one."""

@@ -15,12 +15,11 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from typing_extensions import dataclass_transform
 
-from pcdata.contracts.host import checksums
+from pcdata.contracts.on_host import counts_of
 from pcdata.errors import (
     ConfigError,
     DTypeError,
@@ -30,7 +29,6 @@ from pcdata.errors import (
     UnitError,
     add_note,
 )
-from pcdata.functional.rows import listed_counts
 from pcdata.registry import Registry
 from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
@@ -45,9 +43,11 @@ from pcdata.transforms.decisions import (
     histories_of,
 )
 from pcdata.transforms.field_checks import field_names, length_fields, validated_fields
+from pcdata.transforms.row_sums import row_sums
 
 Data = DepthFrame | PointCloud
 Params = dict[str, Tensor]
+_Values = NDArray[Any] | Tensor  # of params: on another device they are read when they are asked for
 
 REGISTRY: Registry[type[Transform]] = Registry("transform")
 
@@ -247,22 +247,13 @@ class Transform(nn.Module):
             return Decision(entry, stop - 1), stop - 1
         return None
 
-    def told_rows(self, data: Any, params: Params) -> list[int] | None:
+    def told_rows(self, data: Any, params: Params) -> Sequence[int] | None:
         """Return a number per cloud that tells which rows were decided about; None where that needs no telling."""
         if not isinstance(data, PointCloud) or self.decides_by == "point":
             return None
         if self.decides_by == "count":
-            return data.counts.tolist()
-        bounds, sums = data.ptr.tolist(), None
-        for name, values in params.items():
-            if name not in PER_ROW or name == "ptr":
-                continue
-            if name == "index" and values.dtype is not torch.bool:
-                own = checksums(values, params["ptr"].tolist(), bounds)
-            else:
-                own = checksums(values, bounds)
-            sums = own if sums is None else [31 * one + other for one, other in zip(sums, own)]
-        return sums
+            return counts_of(data.ptr)
+        return row_sums(params, data.ptr)
 
     def config_fields(self) -> dict[str, Any]:
         """Return the fields by name, as they were given."""
@@ -329,8 +320,8 @@ class Transform(nn.Module):
         if isinstance(result, DepthFrame):
             (step,) = _NotedSteps(self._note(), _small(params, 1), drawn=drawn, rows=rows)
             return result.with_provenance({"history": [*result.provenance.get("history", ()), step]})
-        before = listed_counts(data.ptr) if isinstance(data, PointCloud) and self.keeps_clouds else None
-        return self.recorded_counts(result, before, listed_counts(result.ptr), params, drawn=drawn, rows=rows)
+        before = counts_of(data.ptr) if isinstance(data, PointCloud) and self.keeps_clouds else None
+        return self.recorded_counts(result, before, counts_of(result.ptr), params, drawn=drawn, rows=rows)
 
     def recorded_counts(
         self,
@@ -340,7 +331,7 @@ class Transform(nn.Module):
         params: Params,
         *,
         drawn: NDArray[np.int64] | None = None,
-        rows: list[int] | None = None,
+        rows: Sequence[int] | None = None,
         place: tuple[str, str] | None = None,
     ) -> PointCloud:
         """Return the result with the step in its history, given the points per cloud before and after it.
@@ -397,11 +388,11 @@ class _NotedSteps:
     def __init__(
         self,
         note: dict[str, Any],
-        params: dict[str, NDArray[Any]],  # (B, ...) each
+        params: dict[str, _Values],  # (B, ...) each
         before: list[int] | None = None,  # points of each cloud; None = other clouds
         after: list[int] | None = None,  # None = a capture
         drawn: NDArray[np.int64] | None = None,  # the stream of each cloud; None = the step is not random
-        rows: list[int] | None = None,  # a number that tells the rows of each
+        rows: Sequence[int] | None = None,  # a number that tells the rows of each
     ) -> None:
         self._note, self._params, self._drawn, self._rows = note, params, drawn, rows
         self._before, self._after = before, after
@@ -413,6 +404,10 @@ class _NotedSteps:
         params = {name: value[clouds] for name, value in self._params.items()}
         lists = (self._before, self._after, self._drawn, self._rows)
         return _NotedSteps(self._note, params, *(None if one is None else one[clouds] for one in lists))  # type: ignore[arg-type]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        params = {name: np.asarray(values.tolist()) for name, values in self._params.items()}
+        return _NotedSteps, (self._note, params, self._before, self._after, self._drawn, self._rows)
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
         listed = {name: value.tolist() for name, value in self._params.items()}
@@ -504,12 +499,15 @@ def sha256_of(identity: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _small(params: Params, num: int) -> dict[str, NDArray[Any]]:
-    """Keep the params worth reading in a history: a few numbers per cloud, not indices or noise."""
-    kept: dict[str, NDArray[Any]] = {}
+def _small(params: Params, num: int) -> dict[str, _Values]:
+    """Keep the params worth reading in a history: a few numbers per cloud, not indices or noise.
+
+    Those on another device stay there until somebody reads them.
+    """
+    kept: dict[str, _Values] = {}
     for name, value in params.items():
         # By name, not by shape alone: with one point per cloud the shapes are the same.
         is_per_cloud = name not in PER_ROW and name not in LISTS
         if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value.numel() <= 16 * num:
-            kept[name] = value.detach().cpu().numpy()
+            kept[name] = value.detach().numpy() if value.device.type == "cpu" else value.detach()
     return kept

@@ -8,11 +8,14 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
+from pcdata.contracts.known import note
+from pcdata.contracts.on_host import on_host, uploaded
 from pcdata.errors import CaptureError, ConfigError
 from pcdata.functional.depth.deproject import Deprojected, deproject_images
 from pcdata.rng import Streams
-from pcdata.structures import CAMERA_FRAME, METRE, DepthFrame, ImageLayout, Kind, PointCloud
-from pcdata.structures.structure import made
+from pcdata.structures import CAMERA_FRAME, METRE, Camera, DepthFrame, ImageLayout, Kind, PointCloud
+from pcdata.structures.image_layout import pixels_of_views
+from pcdata.structures.structure import made, with_tensors
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.families import MaskTransform
 from pcdata.transforms.field_types import ConfidenceName, FromSensor, Metres, confidence_named
@@ -110,12 +113,13 @@ class Deproject(Transform):
     def cloud_of(self, data: DepthFrame, own: Deprojected) -> PointCloud:
         """Return the points with all that the capture, which is checked, knows about them."""
         intrinsics, distortion = self.cameras_of(data)
-        identity = torch.eye(4, dtype=torch.float64, device=data.device).repeat(data.num_views, 1, 1)
-        frames = {CAMERA_FRAME: identity}
+        identity = torch.eye(4, dtype=torch.float64, device="cpu").repeat(data.num_views, 1, 1)
+        frames = {CAMERA_FRAME: uploaded(identity, data.device)}
         if data.world_from_camera is not None and data.frame_id is not None:
             frames[data.frame_id] = data.world_from_camera
         history = tuple(data.provenance.get("history", ()))
         extra = {name: rows for name, rows in own.rows.items() if name != "labels"}
+        note(pixels_of_views(data.size), own.source_index, own.ptr)
         return made(
             PointCloud,
             points=own.points,
@@ -130,23 +134,29 @@ class Deproject(Transform):
             kinds=self.kinds_of(extra),
             layout=None if distortion is not None else ImageLayout(size=data.size, intrinsics=intrinsics),
             viewpoint=torch.zeros(data.num_views, 3, dtype=torch.float32, device=data.device),
-            source_from_cloud=identity.clone(),
+            source_from_cloud=uploaded(identity.clone(), data.device),
             source_frame=CAMERA_FRAME,
             frames=frames,
-            meta=tuple([_view_meta(data, view) for view in range(data.num_views)]),
+            meta=_metas(data),
             history=(history,) * data.num_views,
             recorded_signals={name: signal.repeated(data.num_views) for name, signal in data.recorded_signals.items()},
         )
 
 
-def _view_meta(frame: DepthFrame, view: int) -> dict[str, Any]:
-    """Keep what is needed to trace a cloud to its capture and to deproject it again."""
-    camera = frame.camera.view(view).to_dict()
-    pose = None if frame.world_from_camera is None else frame.world_from_camera[view].tolist()
+def _metas(frame: DepthFrame) -> tuple[dict[str, Any], ...]:
+    """Keep what is needed to trace each view's cloud to its capture and to deproject it again."""
+    cameras: Camera = with_tensors(frame.camera, on_host)
+    poses = None if frame.world_from_camera is None else on_host(frame.world_from_camera).tolist()
     provenance = {name: value for name, value in frame.provenance.items() if name != "history"}
-    return {
-        "sample_id": frame.sample_id,
-        "capture_index": frame.capture_index,
-        "cameras": [{**camera, "view": view, "world_from_camera": pose, "world_frame": frame.frame_id}],
-        "provenance": provenance,
-    }
+    metas = []
+    for view in range(frame.num_views):
+        pose = {"world_from_camera": None if poses is None else poses[view], "world_frame": frame.frame_id}
+        metas.append(
+            {
+                "sample_id": frame.sample_id,
+                "capture_index": frame.capture_index,
+                "cameras": [{**cameras.view(view).to_dict(), "view": view, **pose}],
+                "provenance": {**provenance},
+            }
+        )
+    return tuple(metas)

@@ -10,6 +10,7 @@ import torch
 from annotated_types import Ge
 from torch import Tensor
 
+from pcdata.contracts.on_host import bounds_of, counts_of
 from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
 from pcdata.functional.rows import cloud_of_rows, group_first, ptr_after_mask, ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample, random_sample_index
@@ -128,7 +129,7 @@ class _Sample(SelectTransform, abstract=True):
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Sample, then fill up short clouds as ``if_short`` says; -1 marks a zero row."""
         wanted = self.wanted_counts(cloud, streams)
-        available = cloud.counts.tolist()
+        available = counts_of(cloud.ptr)
         for b, (want, have) in enumerate(zip(wanted, available, strict=True)):
             if have < want and (self.if_short == "error" or (have == 0 and self.if_short != "keep")):
                 raise TooFewPointsError(
@@ -256,7 +257,7 @@ class RandomSample(_Sample):
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Draw short clouds too with replacement, unless they are to get zero rows or to stay short."""
-        if not self.with_replacement or self.if_short in ("zeros", "keep") or 0 in cloud.counts.tolist():
+        if not self.with_replacement or self.if_short in ("zeros", "keep") or 0 in counts_of(cloud.ptr):
             return super().pick(cloud, streams)
         wanted = self.wanted_counts(cloud, streams)
         rows = self.sample(cloud, wanted, streams.seeds().tolist())
@@ -265,7 +266,7 @@ class RandomSample(_Sample):
     def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> Tensor:
         """Take the head of a random permutation of each cloud, or draw each row anew."""
         rows = []
-        for start, have, count, seed in zip(cloud.ptr.tolist(), cloud.counts.tolist(), counts, seeds, strict=False):
+        for start, have, count, seed in zip(bounds_of(cloud.ptr), counts_of(cloud.ptr), counts, seeds, strict=False):
             if self.with_replacement and have != count:  # all that a short cloud has, once
                 drawn = torch.randint(have, (count,), generator=seeded(seed), device="cpu")
             else:
@@ -282,7 +283,7 @@ class RandomShuffle(SelectTransform):
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Draw a permutation of each cloud."""
-        return random_sample_index(cloud.ptr, cloud.counts.tolist(), streams.seeds())
+        return random_sample_index(cloud.ptr, counts_of(cloud.ptr), streams.seeds())
 
 
 class RandomPointCount(RandomSample):

@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.contracts.on_host import bounds_of, counts_of
 from pcdata.errors import ConfigError, FrameError, PcdataError, ReplayError
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.functional.voxels import voxel_downsample, voxel_majority
@@ -146,7 +147,7 @@ class MergeViews(Transform):
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Drop the boundaries between the views of a capture."""
-        bounds = params["group_ptr"].tolist()
+        bounds = bounds_of(params["group_ptr"])
         views = params["views"]
         if data.frame_id == CAMERA_FRAME and int(views.max()) > 1:
             raise FrameError(
@@ -216,7 +217,7 @@ def _same_capture(before: Mapping[str, Any], after: Mapping[str, Any]) -> bool:
 
 
 def _merged_meta(data: PointCloud, start: int, stop: int) -> dict[str, Any]:
-    counts = data.counts.tolist()
+    counts = counts_of(data.ptr)
     cameras = [camera for entry in data.meta[start:stop] for camera in entry.get("cameras", [])]
     merged = {**data.meta[start], "points_per_view": counts[start:stop]}
     return {**merged, "cameras": cameras} if cameras else merged

@@ -13,10 +13,12 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.known import FINITE, note
+from pcdata.contracts.on_host import counts_of, read_together
 from pcdata.errors import PcdataError
 from pcdata.functional.depth.deproject import Deprojected, deproject_into_box
 from pcdata.functional.image_grid import pixels_rise
 from pcdata.structures import DepthFrame, PointCloud
+from pcdata.structures.image_layout import pixels_of_views
 from pcdata.structures.structure import derived
 from pcdata.transforms.base import Data, Params, Transform
 from pcdata.transforms.crop import CropWorkspace
@@ -119,7 +121,8 @@ def _run(
         source_index=made.source_index,
         extra={name: made.rows[name] for name in moved.extra},
     )
-    before, after = readings.tolist(), cloud.counts.tolist()
+    note(pixels_of_views(frame.size), made.source_index, made.ptr)
+    before, after = read_together([readings])[0], counts_of(cloud.ptr)
     cloud = deproject.recorded_counts(cloud, None, before, {}, place=(bare.frame_id, bare.unit))
     if isinstance(move, ToFrame):
         cloud = move.recorded_counts(cloud, before, before, moves)

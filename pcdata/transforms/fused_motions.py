@@ -15,10 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pcdata.contracts.on_host import counts_of
 from pcdata.errors import PcdataError
 from pcdata.functional.motions import draw_motions
 from pcdata.functional.noise import PointStep, move_points
-from pcdata.functional.rows import listed_counts, pick_rows
+from pcdata.functional.rows import pick_rows
 from pcdata.functional.stored_rows import gather_kept
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
@@ -99,7 +100,7 @@ def _run(
     motions = [one["matrix"] for one, _ in decided if "matrix" in one]
     if motions:
         cloud = cloud.with_facts_moved(torch.stack(motions))
-    counts = listed_counts(ptr)
+    counts = counts_of(ptr)
     for step, (params, drawn) in zip(steps, decided, strict=True):
         before, told = counts, counts if step.decides_by == "count" else None
         if isinstance(step, SpatialTransform):
@@ -108,7 +109,7 @@ def _run(
             done.append(step.point_step(params))
         else:
             kept = params["index"], params["ptr"]
-            counts = listed_counts(kept[1])
+            counts = counts_of(kept[1])
         cloud = step.recorded_counts(cloud, before, counts, params, drawn=drawn, rows=told)
     layout = cloud.layout if len(motions) == len(done) else None  # noise leaves no point on its pixel
     # Nothing is refused from here on: memory may change.

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.contracts.on_host import counts_of
 from pcdata.errors import DTypeError, FrameError, ShapeError
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts, segment_max
 from pcdata.structures import PointCloud
@@ -63,7 +64,7 @@ def mix_scenes(
     if params is None:
         params = [{"partner": entry.get("sample_id")} for entry in second.meta]
     note = {"step": "mix_scenes", "version": 1, "fields": {"apart": [*apart]}, "frame": first.frame_id}
-    counts = zip(first.counts.tolist(), mixed.counts.tolist(), params, strict=True)
+    counts = zip(counts_of(first.ptr), counts_of(mixed.ptr), params, strict=True)
     steps = [
         {**note, "unit": first.unit, "params": {**told}, "points_before": before, "points": after}
         for before, after, told in counts

@@ -14,6 +14,7 @@ from annotated_types import Ge, Interval
 from torch import Tensor
 
 from pcdata.contracts.host import negated
+from pcdata.contracts.on_host import bounds_of, counts_of
 from pcdata.errors import ConfigError, PcdataWarning
 from pcdata.functional.plane_patch import plane_patch
 from pcdata.functional.plane_segments import supporting_plane
@@ -168,7 +169,7 @@ class RemovePlane(RemoveTransform):
                 keep &= height > 0
             if self.max_height is not None:
                 keep &= height <= self.max_height
-        parts = [slice(*pair) for pair in pairwise(data.ptr.tolist())]
+        parts = [slice(*pair) for pair in pairwise(bounds_of(data.ptr))]
         patch = torch.cat(
             [plane_patch(data.points[part], own[part], plane, self.distance) for part, plane in zip(parts, planes)]
         )
@@ -251,7 +252,7 @@ class RemovePlane(RemoveTransform):
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Keep the rows and store the planes in the source frame."""
         entries: list[dict[str, Any]] = []
-        for b, (start, stop) in enumerate(pairwise(data.ptr.tolist())):
+        for b, (start, stop) in enumerate(pairwise(bounds_of(data.ptr))):
             plane = params["planes"][b]
             own = pick_rows({"points": data.points[start:stop]}, params["per_point"][start:stop])["points"]
             inliers = int(params["num_inliers"][b])
@@ -321,4 +322,4 @@ def _viewpoints(data: PointCloud) -> Tensor | None:
 
 
 def _sizes(data: PointCloud) -> list[int]:
-    return [int(count) for count in data.counts.tolist()]
+    return [int(count) for count in counts_of(data.ptr)]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pcdata.contracts.on_host import bounds_of
 from pcdata.errors import TooFewPointsError
 from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams, seeded
@@ -39,7 +40,7 @@ class RandomColumn(DropLimit):
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Draw until a column is full enough."""
-        bounds = data.ptr.tolist()
+        bounds = bounds_of(data.ptr)
         seeds = streams.seeds().tolist()
         return self._around(
             data,

@@ -7,6 +7,7 @@ import itertools
 import torch
 from torch import Tensor
 
+from pcdata.contracts.on_host import bounds_of
 from pcdata.errors import ConfigError, DTypeError, FrameError
 from pcdata.functional.nearest import sum_of_squares
 from pcdata.functional.noise import PointStep, dropped_rows, move_points, normal_rows
@@ -129,7 +130,7 @@ class RandomColorJitter(Transform):
         """Adjust each cloud as an image of one column."""
         if data.colors is None:
             raise DTypeError("RandomColorJitter: the cloud has no colors")
-        bounds = data.ptr.tolist()
+        bounds = bounds_of(data.ptr)
         parts = [
             _adjust(data.colors[start:stop], params["factors"][b])
             for b, (start, stop) in enumerate(itertools.pairwise(bounds))

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
+from pcdata.contracts.on_host import bounds_of, counts_of
 from pcdata.errors import DTypeError, ReplayError, TooFewPointsError
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.rng import Streams
@@ -36,7 +37,7 @@ class SplitObjects(DropLimit):
                 )
         member = torch.nn.functional.pad((data.labels >= 0).cumsum(0), (1, 0))
         self.check_drop(
-            data.counts.tolist(),
+            counts_of(data.ptr),
             member[data.ptr].diff().tolist(),
             lambda b: f"points of cloud {b}{sample_name(data, b)}",
         )
@@ -66,7 +67,7 @@ class SplitObjects(DropLimit):
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Split each cloud by its labels."""
-        bounds = params["ptr"].tolist()
+        bounds = bounds_of(params["ptr"])
         parts = []
         for b, cloud in enumerate(data.unbatch()):
             assert cloud.labels is not None  # make_params

@@ -8,6 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from pcdata.contracts.on_host import counts_of
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.functional.voxels import voxel_cells
 from pcdata.rng import Streams, seeded
@@ -83,7 +84,7 @@ class RandomVoxelSample(_OnePerVoxel):
 
     def ranks(self, cloud: PointCloud, streams: Streams) -> Tensor:
         """A random order of the points of each cloud."""
-        counts = cloud.counts.tolist()
+        counts = counts_of(cloud.ptr)
         orders = [
             torch.randperm(count, generator=seeded(seed), device="cpu")
             for count, seed in zip(counts, streams.seeds().tolist())

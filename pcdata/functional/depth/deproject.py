@@ -13,6 +13,8 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
+from pcdata.contracts.known import FINITE, note
+from pcdata.contracts.on_host import bounds_of, on_host, read_together
 from pcdata.contracts.tensors import check_depths, check_tensors
 from pcdata.errors import CaptureError
 from pcdata.functional.rows import (
@@ -22,6 +24,7 @@ from pcdata.functional.rows import (
     pick_rows,
     ptr_after_mask,
     ptr_from_counts,
+    rows_of_mask,
     transform_points,
 )
 from pcdata.geometry.lens import distort_normalized, fold_radius, undistort_normalized
@@ -53,11 +56,15 @@ def deproject_depth(
     height, width = depth.shape[1:]
     rays = pixel_rays(intrinsics, (height, width), distortion).float()
     valid = depth > 0
-    check_rays("deproject_depth", rays, valid)
-    z = depth[valid]
-    points = torch.cat([rays[valid] * z[:, None], z[:, None]], dim=1)
-    pixel_index = valid.reshape(len(depth), height * width).nonzero()[:, 1]
-    return points, ptr_from_counts(valid.sum(dim=(1, 2))), pixel_index
+    beyond = (rays.detach() * depth.detach()[..., None]).isfinite().all(-1).logical_not_() & valid
+    counts, (lost, wild) = read_together([valid.sum(dim=(1, 2)), torch.stack([_lost(rays, valid), beyond.sum()])])
+    _require_rays("deproject_depth", lost)
+    rows = rows_of_mask(valid.flatten(), sum(counts))
+    z = depth.flatten()[rows]
+    points = torch.cat([rays.flatten(0, 2)[rows] * z[:, None], z[:, None]], dim=1)
+    if not wild:
+        note(FINITE, points)
+    return points, ptr_from_counts(counts, depth.device), rows % (height * width)
 
 
 @inner
@@ -222,7 +229,7 @@ def check_intrinsics(where: str, intrinsics: Tensor) -> None:
     Raises:
         CaptureError: the first fault, with the view and what to do.
     """
-    for view, (row0, row1, row2) in enumerate(intrinsics.tolist()):
+    for view, (row0, row1, row2) in enumerate(on_host(intrinsics).tolist()):
         found = f"{where}: the intrinsics of view {view}"
         if row2 != [0.0, 0.0, 1.0]:
             raise CaptureError(f"{found} must have the last row 0 0 1, got {row2}; is the matrix transposed?")
@@ -242,10 +249,17 @@ def check_rays(where: str, rays: Tensor, needed: Tensor) -> None:
     Raises:
         CaptureError: with the number of pixels that have none.
     """
-    lost = needed & rays[..., 0].isnan()
-    if bool(lost.any()):
+    _require_rays(where, int(_lost(rays, needed)))
+
+
+def _lost(rays: Tensor, needed: Tensor) -> Tensor:
+    return (needed & rays[..., 0].isnan()).sum()
+
+
+def _require_rays(where: str, lost: int) -> None:
+    if lost:
         raise CaptureError(
-            f"{where}: the lens model cannot be inverted at {int(lost.sum())} pixels that have a reading (they lie "
+            f"{where}: the lens model cannot be inverted at {lost} pixels that have a reading (they lie "
             "beyond the radius where it folds back); check the order of the coefficients, or set those pixels to 0"
         )
 
@@ -272,6 +286,6 @@ def _pinhole(intrinsics: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor
 
 
 def _distort_rows(xy: Tensor, ptr: Tensor, distortion: Tensor) -> Tensor:
-    bounds = ptr.tolist()
+    bounds = bounds_of(ptr)
     clouds = zip(bounds, bounds[1:], distortion)
     return torch.cat([distort_normalized(xy[start:stop][None], one[None])[0] for start, stop, one in clouds])
