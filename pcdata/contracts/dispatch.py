@@ -27,6 +27,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.arguments import Contract
+from pcdata.contracts.compiling import called_apart, is_traced
 from pcdata.contracts.numbers import Spec
 from pcdata.errors import BackendError, SlowBackendWarning, near_matches
 
@@ -105,6 +106,9 @@ def op(
 
         @functools.wraps(reference)
         def public(*args: P.args, **kwargs: P.kwargs) -> R:
+            if is_traced():
+                found: R = called_apart(public, *args, **kwargs)
+                return found
             arguments = contract.bind(args, kwargs)
             contract.check(arguments)
             backend = arguments.pop("backend", "auto")

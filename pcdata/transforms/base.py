@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from typing_extensions import dataclass_transform
 
+from pcdata.contracts.compiling import called_apart, is_traced
 from pcdata.contracts.on_host import counts_of
 from pcdata.errors import (
     ConfigError,
@@ -170,6 +171,8 @@ class Transform(nn.Module):
             data: a ``DepthFrame`` or ``PointCloud``, as the step takes.
             generator: required by random steps: one CPU generator, one per cloud, or streams.
         """
+        if is_traced():
+            return called_apart(Transform.forward, self, data, generator=generator)
         try:
             self.check_input(data)
             streams, drawn = self.no_streams, None

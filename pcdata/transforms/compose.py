@@ -10,6 +10,7 @@ from typing import Any
 
 from torch import Generator, Tensor, nn
 
+from pcdata.contracts.compiling import called_apart, is_traced
 from pcdata.contracts.known import forget, keeping_known, knowing_nothing
 from pcdata.errors import ConfigError
 from pcdata.files.opening import read_text
@@ -93,6 +94,8 @@ class Compose(Transform):
 
     def forward(self, data: Data, *, generator: GeneratorLike | None = None) -> Any:
         """Run every step from the first that takes the data; the steps record themselves, the chain adds nothing."""
+        if is_traced():
+            return called_apart(Compose.forward, self, data, generator=generator)
         return self._run(data, generator)
 
     def consume(
