@@ -74,6 +74,12 @@ def rows_of_mask(mask: Tensor, count: int) -> Tensor:
     return torch.searchsorted(mask.cumsum(0), ranks)
 
 
+def picked_rows(mask: Tensor, ptr: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the rows where a (N,) mask is true, and their row pointers (B+1,); the host waits once."""
+    after = ptr_after_mask(mask, ptr)
+    return rows_of_mask(mask, bounds_of(after)[-1]), after
+
+
 @inner
 def pick_rows(fields: Mapping[str, Tensor], rows: Tensor, *, in_place: bool = False) -> dict[str, Tensor]:
     """Return ``field[rows]`` of every (N, ...) field, for (M,) int64 rows or a (N,) bool mask.

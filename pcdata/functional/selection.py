@@ -10,10 +10,10 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_places, numbers_on_host
-from pcdata.contracts.on_host import on_host, uploaded
+from pcdata.contracts.on_host import on_host, read_together, uploaded
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, ShapeError
-from pcdata.functional.rows import cloud_of_rows, group_first
+from pcdata.functional.rows import cloud_of_rows, group_first, rows_of_mask
 from pcdata.functional.voxels import numbered_rows
 from pcdata.threads import at_once
 
@@ -142,30 +142,42 @@ def convex_hull(
 @inner
 def hull_rows(points: Tensor, *, backend: str = "auto") -> Tensor:  # (P,) int64
     """Return the rows that :func:`convex_hull` gives, of points (N, 2) float64."""
-    rows = torch.arange(len(points), dtype=torch.int64, device=points.device)
-    if not len(rows):
-        return rows
+    row = torch.arange(len(points), dtype=torch.int64, device=points.device)
+    if not len(row):
+        return row
     x, y = points.unbind(1)
-    left = (x == x.min()).nonzero().squeeze(1)
-    right = (x == x.max()).nonzero().squeeze(1)
-    first, last = left[y[left].argmin()], right[y[right].argmax()]
-    if bool((points[first] == points[last]).all()):
-        return first[None]
-    corners: list[Tensor] = []
-    # Edges of the hull so far, each with the points to its right; the farthest of those is a corner too.
-    stack = [(last, first, rows), (first, last, rows)]
-    while stack:
-        a, b, around = stack.pop()
-        edge, offset = points[b] - points[a], points[around] - points[a]
-        beyond = offset[:, 0] * edge[1] - offset[:, 1] * edge[0]
-        outside = beyond > 1e-12 * float(edge.square().sum())
-        if not bool(outside.any()):
-            corners.append(a)
-            continue
-        around, beyond = around[outside], beyond[outside]
-        farthest = around[beyond.argmax()]
-        stack += [(farthest, b, around), (a, farthest, around)]
-    return torch.stack(corners)
+    first = torch.where(x == x.min(), y, torch.inf).argmin()
+    last = torch.where(x == x.max(), y, -torch.inf).argmax()
+    # Edges of the hull so far, in order, and the points to the right of each: the farthest of those is a corner too.
+    begin, end = torch.stack([first, last]), torch.stack([last, first])
+    edge = torch.zeros_like(row)
+    row, edge = torch.cat([row, row]), torch.cat([edge, edge + 1])
+    is_one = (points[first] == points[last]).all()
+    while True:
+        side = points[end] - points[begin]
+        offset, across = points[row] - points[begin[edge]], side[edge]
+        beyond = offset[:, 0] * across[:, 1] - offset[:, 1] * across[:, 0]
+        outside = beyond > (1e-12 * side.square().sum(1))[edge]
+        splits = torch.zeros_like(begin).scatter_reduce_(0, edge, outside.long(), "amax")
+        (one,), (count,), (new,) = read_together([is_one, outside.sum(), splits.sum()])
+        if one:
+            return begin[:1]
+        if not count:
+            return begin
+        kept = rows_of_mask(outside, count)
+        row, edge, beyond = row[kept], edge[kept], beyond[kept]
+        farthest = beyond.new_full((len(begin),), -torch.inf).scatter_reduce_(0, edge, beyond, "amax")
+        place = torch.arange(count, dtype=torch.int64, device=row.device)
+        place = torch.where(beyond == farthest[edge], place, count)
+        corner = torch.full_like(begin, count).scatter_reduce_(0, edge, place, "amin").clamp(max=count - 1)
+        # An edge that is split becomes two, one after the other, and both look at its points.
+        number = torch.arange(len(begin), dtype=torch.int64, device=row.device) + splits.cumsum(0) - splits
+        begins, ends = (torch.empty(len(begin) + new, dtype=torch.int64, device=row.device) for _ in range(2))
+        begins[number], ends[number] = begin, torch.where(splits > 0, row[corner], end)
+        begins[number + splits], ends[number + splits] = torch.where(splits > 0, row[corner], begin), end
+        first_piece = number[edge]
+        row, edge = torch.cat([row, row]), torch.cat([first_piece, first_piece + 1])
+        begin, end = begins, ends
 
 
 def plane_axes(plane: Tensor) -> Tensor:

@@ -133,7 +133,7 @@ class Deproject(Transform):
             extra=extra,
             kinds=self.kinds_of(extra),
             layout=None if distortion is not None else ImageLayout(size=data.size, intrinsics=intrinsics),
-            viewpoint=torch.zeros(data.num_views, 3, dtype=torch.float32, device=data.device),
+            viewpoint=uploaded(torch.zeros(data.num_views, 3, dtype=torch.float32, device="cpu"), data.device),
             source_from_cloud=uploaded(identity.clone(), data.device),
             source_frame=CAMERA_FRAME,
             frames=frames,

@@ -206,10 +206,9 @@ class _FarthestPoints(_Sample, abstract=True):
         features = cloud.points
         if self.color_weight and cloud.colors is not None:
             features = torch.cat([features, self.color_weight * cloud.colors], dim=1)
-        asked = torch.tensor(counts, dtype=torch.int64, device=cloud.device)
         given = self.starts(cloud, seeds)
         labels = cloud.labels if self.balance_labels else None
-        return farthest_point_sample(features, cloud.ptr, num_samples=asked, labels=labels, **given)[0]
+        return farthest_point_sample(features, cloud.ptr, num_samples=counts, labels=labels, **given)[0]
 
 
 class FarthestPointSample(_FarthestPoints):

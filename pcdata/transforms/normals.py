@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
+from pcdata.contracts.known import FINITE, note
 from pcdata.errors import FrameError
 from pcdata.functional.normals import estimate_normals, orient_normals
 from pcdata.structures import PointCloud
@@ -40,5 +41,6 @@ class EstimateNormals(Transform):
                     "EstimateNormals: the cloud has no viewpoint to face; set PointCloud.viewpoint to where the sensor "
                     "stood, or choose orient: none"
                 )
+            note(FINITE, normals)  # those of finite points are
             normals = orient_normals(data.points, normals, viewpoint)
         return data.with_fields(normals=normals)

@@ -1,4 +1,4 @@
-"""``torch.compile``: a network compiles once whatever batches come, and is cut where it calls an operation or a step."""
+"""``torch.compile``: a network compiles once for all batches, and is cut where it calls an operation or a step."""
 
 from __future__ import annotations
 

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from pcdata.contracts.on_host import counts_of, on_host
 from pcdata.functional.nearest import sum_of_squares
-from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask, ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, group_count, picked_rows, ptr_from_counts
 
 LEAF_SIZE = 16
 FAN_OUT = 8
@@ -36,7 +37,7 @@ class _Groups:
     def of(cls, ptr: Tensor, size: int) -> _Groups:
         """Cut (B+1,) row pointers into groups of at most ``size`` rows."""
         counts = counts_from_ptr(ptr)
-        group_ptr = ptr_from_counts((counts + size - 1) // size)
+        group_ptr = ptr_from_counts((counts_from_ptr(on_host(ptr)) + size - 1) // size, ptr.device)
         cloud = cloud_of_rows(group_ptr)
         rank = torch.arange(len(cloud), dtype=torch.int64, device=ptr.device) - group_ptr[cloud]
         return cls(group_ptr, ptr[cloud] + rank * size, (counts[cloud] - rank * size).clamp(max=size), size)
@@ -100,10 +101,11 @@ class BoxTree:
         depth) would otherwise cost quadratic time.
         """
         kept = _first_copies(points[order], ptr, max_copies)
-        order, ptr = order[kept], ptr_after_mask(kept, ptr)
+        rows, ptr = picked_rows(kept, ptr)
+        order = order[rows]
         leaves = Leaves.of(points, ptr, order)
         levels = [leaves.level]
-        while int(counts_from_ptr(levels[-1].groups.ptr).max()) > 1:
+        while max(counts_of(levels[-1].groups.ptr)) > 1:
             levels.append(_parents(levels[-1]))
         filled = torch.where(leaves.real[..., None], leaves.points, torch.inf)
         coordinates = torch.cat([filled, filled.new_full((1, LEAF_SIZE, 3), torch.inf)]).permute(2, 0, 1).contiguous()
@@ -129,12 +131,13 @@ def box_gap(low: Tensor, high: Tensor, other_low: Tensor, other_high: Tensor) ->
 def expand_ranges(first: Tensor, count: Tensor, owner: Tensor) -> tuple[Tensor, Tensor]:
     """Replace each range of rows by one (owner, row) pair per row, in order."""
     total = torch.cumsum(count, 0)
-    source = torch.repeat_interleave(torch.arange(len(first), dtype=torch.int64, device=first.device), count)
+    rows = torch.arange(len(first), dtype=torch.int64, device=first.device)
+    source = torch.repeat_interleave(rows, count, output_size=int(total[-1]) if len(total) else 0)
     rank = torch.arange(len(source), dtype=torch.int64, device=first.device) - (total - count)[source]
     return owner[source], first[source] + rank
 
 
-def spatial_order(points: Tensor, cloud: Tensor) -> Tensor:
+def spatial_order(points: Tensor, cloud: Tensor, num_clouds: int) -> Tensor:
     """Return (N,) int64 rows that put (N,3) points in order of (N,) cloud, then Morton code; equal ones stay in order.
 
     A run of more than a leaf of equal codes that are not equal points is coded again in its own cube, so one stray
@@ -142,28 +145,30 @@ def spatial_order(points: Tensor, cloud: Tensor) -> Tensor:
     """
     segment, order = torch.sort(cloud, stable=True)
     place = torch.arange(len(points), dtype=torch.int64, device=points.device)
+    num_segments = num_clouds  # some may be empty
     while len(place):
-        _, segment = torch.unique_consecutive(segment, return_inverse=True)
-        code = _morton_code(points[order[place]], segment)
+        code = _morton_code(points[order[place]], segment, num_segments)
         code, by_code = torch.sort(code, stable=True)
-        if int(segment[-1]) > 0:
+        if num_segments > 1:
             by_segment = torch.argsort(segment[by_code], stable=True)
             code, by_code = code[by_segment], by_code[by_segment]
         order[place] = order[place][by_code]
         changes = (code[1:] != code[:-1]) | (segment[1:] != segment[:-1])
         run = torch.cat([changes.new_zeros(1), changes]).cumsum(0)
-        crowded = torch.bincount(run)[run] > LEAF_SIZE
+        crowded = (group_count(run, len(run))[run] > LEAF_SIZE).nonzero().squeeze(1)
         place, segment = place[crowded], run[crowded]
         if len(place):
-            _, dense = torch.unique_consecutive(segment, return_inverse=True)
-            low, high = _bounds(points[order[place]], dense)
-            spread = (low != high).any(1)[dense]
+            changes = segment[1:] != segment[:-1]
+            segment = torch.cat([changes.new_zeros(1), changes]).cumsum(0)
+            num_segments = int(segment[-1]) + 1
+            low, high = _bounds(points[order[place]], segment, num_segments)
+            spread = (low != high).any(1)[segment].nonzero().squeeze(1)
             place, segment = place[spread], segment[spread]
     return order
 
 
-def _morton_code(points: Tensor, segment: Tensor) -> Tensor:
-    low, high = _bounds(points.double(), segment)
+def _morton_code(points: Tensor, segment: Tensor, num_segments: int) -> Tensor:
+    low, high = _bounds(points.double(), segment, num_segments)
     extent = (high - low).amax(1, keepdim=True)
     scale = torch.where(extent > 0, (2**_BITS - 1) / extent, 0.0)
     cell = ((points - low[segment]) * scale[segment]).long()
@@ -179,9 +184,8 @@ def _spread_bits(value: Tensor) -> Tensor:
     return (value | value << 2) & 0x1249249249249249
 
 
-def _bounds(points: Tensor, segment: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the (S,3) lowest and highest corner of every segment; segments are numbered from 0, none is empty."""
-    num_segments = int(segment[-1]) + 1
+def _bounds(points: Tensor, segment: Tensor, num_segments: int) -> tuple[Tensor, Tensor]:
+    """Return the (S,3) lowest and highest corner of every segment; of an empty one they mean nothing."""
     if num_segments == 1:
         return points.amin(0, keepdim=True), points.amax(0, keepdim=True)
     index = segment[:, None].expand(-1, 3)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from pcdata.functional.radius import cell_side, require_cells
-from pcdata.functional.rows import cloud_of_rows
+from pcdata.functional.rows import cloud_of_rows, group_count
 from pcdata.kernels.torch_tree.boxtree import expand_ranges
 
 _REACH = 2  # ceil(sqrt(3)), and a margin: neighbors within the radius are at most two cells away on every axis
@@ -42,16 +42,16 @@ class Cells:
         index = cloud[:, None].expand(-1, 3)
         low = points.new_full((len(ptr) - 1, 3), torch.inf).scatter_reduce_(0, index, points, "amin").double()
         scaled = (points - low[cloud]) / cell_side(radius)
-        if len(points):
-            require_cells(where, radius, float(scaled.max()))
+        largest: list[float] = scaled.amax(0).tolist() if len(points) else [0.0, 0.0, 0.0]
+        require_cells(where, radius, max(largest))
         # Room of _REACH on both sides, so that a neighbor's coordinate never runs into the next column.
         coordinate = scaled.long() + _REACH
-        spans = tuple(int(axis.max()) + _REACH + 1 if len(axis) else 1 for axis in coordinate.unbind(1))
+        spans = tuple(int(most) + 2 * _REACH + 1 for most in largest)
         number, keys = cloud, []
         for axis, span in zip(coordinate.unbind(1), spans):
             unique, number = torch.unique(number * span + axis, return_inverse=True)
             keys.append(unique)
-        count = torch.bincount(number, minlength=len(keys[2]))
+        count = group_count(number, len(keys[2]))
         return cls(number, count, (keys[0], keys[1], keys[2]), (spans[0], spans[1], spans[2]))
 
     def __len__(self) -> int:

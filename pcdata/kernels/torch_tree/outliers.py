@@ -7,7 +7,7 @@ from torch import Tensor
 import pcdata.functional.outliers  # noqa: F401 - the operation must be registered before its kernel
 from pcdata.contracts.dispatch import kernel
 from pcdata.functional.image_grid import ImageGrid
-from pcdata.functional.rows import ptr_after_mask
+from pcdata.functional.rows import picked_rows
 from pcdata.kernels.torch_tree.cells import Cells
 from pcdata.kernels.torch_tree.search import nearest_chunks
 
@@ -19,7 +19,7 @@ def radius_outlier_mask(
     """Count the points of every cell, then search around those in cells that are not full."""
     # All points of a cell are within the radius of each other: a full cell needs no distances.
     outlier = Cells.within("radius_outlier_mask", points, ptr, radius).crowd() <= min_neighbors
-    undecided = outlier.nonzero().squeeze(1)
+    undecided, undecided_ptr = picked_rows(outlier, ptr)
     if len(undecided) == 0:
         return outlier
     searches = nearest_chunks(
@@ -27,7 +27,7 @@ def radius_outlier_mask(
         ptr,
         min_neighbors + 1,
         queries=points[undecided],
-        queries_ptr=ptr_after_mask(outlier, ptr),
+        queries_ptr=undecided_ptr,
         radius=radius,
     )
     for query, squared, _ in searches:

@@ -16,15 +16,18 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import INNER, kernel
+from pcdata.contracts.on_host import bounds_of, counts_of, read_together, uploaded
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.nearest import Neighbors
 from pcdata.functional.neighbors import Listed, cut_to_radii, grown_within, laid_out, widest
 from pcdata.functional.radius import largest_squared
-from pcdata.functional.rows import cloud_of_rows
+from pcdata.functional.rows import cloud_of_rows, group_count, rows_of_mask
 from pcdata.kernels.torch_tree.boxtree import LEAF_SIZE, BoxTree, Leaves, box_gap, expand_ranges, spatial_order
 from pcdata.threads import at_once
 
 _GROUPS_PER_CHUNK = 512
+# Widths of tables, growing by a third to a half, so that padding stays small.
+_WIDTHS = [1, *(width for power in range(1, 32) for width in (1 << power, 3 << (power - 1)))]
 _MAX_PAIRS = 1 << 16  # (query, point) or (group, box) pairs alive at once: temporaries that stay in cache
 
 
@@ -49,8 +52,9 @@ def nearest_chunks(
     leaves: Leaves | None = None
     if queries is None or queries_ptr is None:
         queries, queries_ptr = points, ptr
-        tree = BoxTree.build(points, ptr, spatial_order(points, cloud_of_rows(ptr)), max_copies=k)
-        if bool(tree.kept.all()):  # the queries are the leaves themselves
+        order = spatial_order(points, cloud_of_rows(ptr), len(ptr) - 1)
+        tree = BoxTree.build(points, ptr, order, max_copies=k)
+        if bounds_of(tree.ptr) == bounds_of(ptr):  # all are kept: the queries are the leaves themselves
             leaves, home = (
                 tree.leaves,
                 torch.arange(len(tree.leaves), dtype=torch.int64, device=ptr.device)[:, None].expand(-1, LEAF_SIZE),
@@ -101,13 +105,14 @@ def _build_together(
     The leaf is (G, 16), -1 where the cloud has no points.
     """
     cloud = torch.cat([cloud_of_rows(ptr), cloud_of_rows(queries_ptr)])
-    order = spatial_order(torch.cat([points, queries]), cloud)
+    order = spatial_order(torch.cat([points, queries]), cloud, len(ptr) - 1)
     is_point = order < len(points)
-    tree = BoxTree.build(points, ptr, order[is_point], max_copies=max_copies)
-    leaves = Leaves.of(queries, queries_ptr, order[~is_point] - len(points))
+    of_points, of_queries = rows_of_mask(is_point, len(points)), rows_of_mask(~is_point, len(queries))
+    tree = BoxTree.build(points, ptr, order[of_points], max_copies=max_copies)
+    leaves = Leaves.of(queries, queries_ptr, order[of_queries] - len(points))
     seen = torch.zeros_like(order)
-    seen[is_point] = tree.kept.long()
-    place = torch.cumsum(seen, 0)[~is_point] - 1  # the last point before each query on the curve
+    seen[of_points] = tree.kept.long()
+    place = torch.cumsum(seen, 0)[of_queries] - 1  # the last point before each query on the curve
     cloud = cloud_of_rows(queries_ptr)
     first, end = tree.ptr[cloud], tree.ptr[cloud + 1]
     home = tree.leaf_ptr[cloud] + torch.minimum(place.clamp(min=0), end - 1).sub_(first).clamp_(min=0) // LEAF_SIZE
@@ -196,16 +201,21 @@ class _Search:
         """Descend all levels at once with (group, node) pairs, from each group's root; ``bound`` is (g, 16)."""
         root_ptr = self.tree.levels[-1].groups.ptr
         cloud = self.cloud[groups]
-        group = (root_ptr[cloud + 1] > root_ptr[cloud]).nonzero().squeeze(1)  # counts within this chunk
+        group = torch.arange(len(groups), dtype=torch.int64, device=groups.device)  # counts within this chunk
+        if 0 in counts_of(root_ptr):
+            group = (root_ptr[cloud + 1] > root_ptr[cloud]).nonzero().squeeze(1)
         node = root_ptr[cloud[group]]
         group_bound = torch.where(self.leaves.real[groups], bound, -torch.inf).amax(1)
         low, high = self.leaves.level.low[groups], self.leaves.level.high[groups]
         for depth in range(len(self.tree.levels) - 1, -1, -1):
             level = self.tree.levels[depth]
             near = box_gap(low[group], high[group], level.low[node], level.high[node]) <= group_bound[group]
-            group, node = group[near], node[near]
             if depth:
-                group, node = expand_ranges(level.groups.first[node], level.groups.count[node], group)
+                children = torch.where(near, level.groups.count[node], 0)
+                group, node = expand_ranges(level.groups.first[node], children, group)
+            else:
+                rows = near.nonzero().squeeze(1)
+                group, node = group[rows], node[rows]
             if len(group) > at_once(group.device, _MAX_PAIRS) and len(groups) > 1:
                 # A bound too loose for so many groups at once: walk again with half of them, never with more memory.
                 half = len(groups) // 2
@@ -223,14 +233,17 @@ class _Search:
         query, by_query = torch.sort(group[pair] * LEAF_SIZE + slot, stable=True)
         leaf = leaf[pair][by_query]
         points, row = points.flatten(0, 1), self.leaves.row[groups].flatten()
-        counts = torch.bincount(query, minlength=len(row))
+        counts = group_count(query, len(row))
         start = torch.cumsum(counts, 0) - counts
         leaf = torch.cat([leaf, leaf.new_full((1,), len(self.tree.leaves))])  # what empty places of a table read
-        counts = torch.where(self.leaves.real[groups].flatten(), counts, -1)  # a repeated slot is no query
-        narrower = -1
-        for width in _widths(int(counts.max())):
-            chosen = ((counts > narrower) & (counts <= width)).nonzero().squeeze(1)
-            narrower = width
+        # Queries by the width of table that holds them; a repeated slot is no query, and comes last.
+        widths = uploaded(torch.tensor(_WIDTHS, dtype=torch.int64, device="cpu"), row.device)
+        table = torch.where(self.leaves.real[groups].flatten(), torch.searchsorted(widths, counts), len(_WIDTHS))
+        (sizes,) = read_together([group_count(table, len(_WIDTHS) + 1)])
+        by_width = table.argsort(stable=True).split(sizes)
+        for width, chosen in zip(_WIDTHS, by_width):
+            if not len(chosen):
+                continue
             places = torch.arange(width, dtype=torch.int64, device=row.device)
             per_part = max(1, at_once(row.device, _MAX_PAIRS) // (width * LEAF_SIZE))
             for begin in range(0, len(chosen), per_part):
@@ -253,11 +266,3 @@ class _Search:
             squared = torch.nn.functional.pad(squared, (0, self.k - k), value=torch.inf)
             index = torch.nn.functional.pad(index, (0, self.k - k), value=self.tree.num_points)
         return row, squared, index
-
-
-def _widths(largest: int) -> list[int]:
-    """Table widths that cover 1 to ``largest``, growing by a third to a half, so padding stays small."""
-    widths = [1, 2, 3, 4]
-    while widths[-1] < largest:
-        widths.append(widths[-2] * 2)
-    return widths
