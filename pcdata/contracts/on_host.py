@@ -61,13 +61,14 @@ def uploaded(values: Tensor, device: torch.device) -> Tensor:
 
 def bounds_of(ptr: Tensor) -> list[int]:
     """Return row pointers as a list."""
-    bounds: list[int] = on_host(ptr).tolist()
+    bounds: list[int] = (ptr if ptr.device.type == "cpu" else on_host(ptr)).tolist()
     return bounds
 
 
 def counts_of(ptr: Tensor) -> list[int]:
     """Return the number of rows of every cloud as a list."""
-    return [stop - start for start, stop in pairwise(bounds_of(ptr))]
+    bounds = (ptr if ptr.device.type == "cpu" else on_host(ptr)).tolist()
+    return [stop - start for start, stop in pairwise(bounds)]
 
 
 def read_together(tensors: Sequence[Tensor]) -> list[list[Any]]:
