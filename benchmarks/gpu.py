@@ -174,7 +174,7 @@ def timing_cases(device: torch.device, size: tuple[int, int]) -> Iterator[tuple[
             T.MaskDepth(near=0.2, far=2.0),
             T.Deproject(),
             T.RemoveStatisticalOutliers(num_neighbors=20, std_ratio=2.0),
-            T.RemoveRadiusOutliers(radius=0.02, min_neighbors=10),
+            T.RemoveRadiusOutliers(radius=0.02 if size[0] >= 100 else 0.2, min_neighbors=10),
             T.RemovePlane(distance=0.01),
             T.FarthestPointSample(num_points=256 if size[0] < 100 else 1024),
             T.EstimateNormals(radius=0.02, max_neighbors=30),
@@ -211,11 +211,11 @@ def timing_cases(device: torch.device, size: tuple[int, int]) -> Iterator[tuple[
     many = points[:1].new_empty((128 * each, 3))
     many.copy_(torch.rand(128 * each, 3, generator=seeded(0)))
     ptr = (torch.arange(129, device="cpu") * each).to(device)
-    fewer = min(128, each)
+    few = min(128, each)
     yield (
-        f"farthest points 128 x {each} to {fewer}",
+        f"farthest points 128 x {each} to {few}",
         0.15,
-        lambda: F.farthest_point_sample(many, ptr, num_samples=fewer),
+        lambda: F.farthest_point_sample(many, ptr, num_samples=few),
     )
     yield "normals 2 cm, 30", 0.6, lambda: F.estimate_normals(points, radius=0.02, max_neighbors=30, grid=grid)
     yield "flying pixels", None, lambda: F.flying_pixel_mask(frame.depth)

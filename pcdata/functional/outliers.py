@@ -16,6 +16,9 @@ from pcdata.functional.nearest import nearest_chunks, pair_chunks, rooted
 from pcdata.functional.radius import require_extent, squared_radius
 from pcdata.functional.rows import cloud_of_rows, counts_from_ptr
 
+# Interleaved sums: as many as threads of a GPU that work together.
+_RUNS = 1024
+
 
 @op(
     points="N 3",
@@ -66,17 +69,17 @@ def statistical_outlier_mask(
 
 
 def _interleaved_sum(values: Tensor, ptr: Tensor) -> Tensor:
-    """Sum each cloud's values in eight interleaved runs, then these in order: every backend rounds alike.
+    """Sum each cloud's values in interleaved runs, then add halves of these to each other: every backend rounds alike.
 
     The mask hangs on the last bit where all means are equal.
     """
     cloud = cloud_of_rows(ptr)
-    run = cloud * 8 + (torch.arange(len(values), dtype=torch.int64, device=values.device) - ptr[cloud]) % 8
-    runs = values.new_zeros(8 * (len(ptr) - 1)).index_add(0, run, values).reshape(-1, 8)
-    total = torch.zeros_like(runs[:, 0])
-    for part in runs.unbind(1):
-        total = total + part
-    return total
+    run = cloud * _RUNS + (torch.arange(len(values), dtype=torch.int64, device=values.device) - ptr[cloud]) % _RUNS
+    runs = values.new_zeros(_RUNS * (len(ptr) - 1)).index_add(0, run, values).reshape(-1, _RUNS)
+    while runs.shape[1] > 1:
+        one, other = runs.chunk(2, dim=1)
+        runs = one + other
+    return runs[:, 0]
 
 
 @op(points="N 3", ptr="ptr N B", min_neighbors=checked_count, radius=checked_length, grid=checked_grid, gradient=False)

@@ -69,8 +69,9 @@ def declared(text: str, theme: str) -> list[Kernel]:
         ValueError: an argument is no pointer, int64_t or double.
     """
     text = re.sub(r"//[^\n]*", "", text)
-    for name, parameters in _DEFINED.findall(text):  # that several kernels share
-        text = text.replace(f", {name})", f", {parameters.replace(chr(92), ' ')})")
+    for name, parameters in reversed(_DEFINED.findall(text)):  # that several kernels share
+        shared = parameters.replace("\\", " ")
+        text = re.sub(rf"(?<!#define )\b{name}\b", lambda _, shared=shared: shared, text)
     return [
         Kernel(name, theme, KINDS[kind], tuple(_parameter(name, one) for one in listed.split(",")))
         for kind, name, listed in _KERNEL.findall(text)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
-import pcdata.functional.neighbors  # noqa: F401 - the functions must be registered before their kernels
-from pcdata.contracts.dispatch import INNER, kernel
+import pcdata.functional.neighbors
+import pcdata.functional.normals  # noqa: F401 - the functions must be registered before their kernels
+from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.nearest import Neighbors
 from pcdata.functional.neighbors import Listed, grown_within
@@ -20,6 +21,7 @@ from pcdata.kernels.cuda.trees import BoxTree, box_tree, in_order
 
 _MOST_ROWS = 2**31 - 2  # rows have 32 bits in a key
 _FEW = (8, 16, 32, 64)  # neighbors that a thread keeps to itself
+_CHUNK = 1 << 18  # queries
 _BLOCK = 128  # threads: four warps, each with queries of its own
 
 
@@ -41,8 +43,7 @@ def nearest_rows(
         return fallen
     launcher = launcher_of(points)
     tree = box_tree(launcher, points.detach().contiguous(), ptr.contiguous())
-    index, distance, _ = searched(launcher, tree, k, **own)
-    return index, distance
+    return searched(launcher, tree, k, **own)
 
 
 @kernel("nearest_chunks", "cuda")
@@ -55,15 +56,16 @@ def nearest_chunks(
     queries_ptr: Tensor | None = None,
     radius: float | Tensor | None = None,
 ) -> Iterator[Neighbors]:
-    """Find the neighbors of all queries, and yield them at once."""
+    """Find the neighbors of all queries, then yield some at a time: callers make larger tensors of them."""
     own: dict[str, Any] = {"queries": queries, "queries_ptr": queries_ptr, "radius": radius}
     if points.shape[1] != 3 or max(k, len(points)) > _MOST_ROWS:
         yield from INNER["nearest_chunks"].reference(points, ptr, k, **own)
         return
     launcher = launcher_of(points)
     tree = box_tree(launcher, points.detach().contiguous(), ptr.contiguous())
-    index, squared, _ = searched(launcher, tree, k, **own, squared=True)
-    yield torch.arange(len(index), dtype=torch.int64, device=points.device), squared, index
+    index, squared = searched(launcher, tree, k, **own, squared=True)
+    queried = torch.arange(len(index), dtype=torch.int64, device=points.device)
+    yield from zip(queried.split(_CHUNK), squared.split(_CHUNK), index.split(_CHUNK))
 
 
 @kernel("rows_within", "cuda")
@@ -82,6 +84,35 @@ def rows_within(
     return grown_within(search, points, ptr, radius, queries, queries_ptr, exclude_self)
 
 
+@kernel("estimate_normals", "cuda")
+def estimate_normals(
+    points: Tensor, ptr: Tensor, radius: float | None, max_neighbors: int, grid: ImageGrid | None
+) -> Tensor:
+    """Sum up each neighborhood where it was found."""
+    k = reachable(max_neighbors, points)
+    if k > _FEW[-1] or len(points) > _MOST_ROWS:
+        reference = OPERATIONS["estimate_normals"].reference
+        fallen: Tensor = reference(points, ptr, radius=radius, max_neighbors=max_neighbors, backend="cuda")
+        return fallen
+    launcher = launcher_of(points)
+    tree = box_tree(launcher, points, ptr)
+    normals = torch.empty_like(points)
+    _start(launcher, "pc_normals", _FEW[2:], tree, k, tree.points, tree.ptr, tree.order, radius, normals)
+    return normals
+
+
+def reachable(count: int, points: Tensor) -> int:
+    """Return a number of neighbors that gives the same answer, and is no larger than need be."""
+    return min(count, max(1, len(points)))
+
+
+def mean_distances(launcher: Launcher, tree: BoxTree, k: int) -> Tensor:
+    """Return (N,) float64: the mean distance of each point to its nearest ``k``, at most 64 of them."""
+    mean = torch.empty(len(tree.points), dtype=torch.float64, device=tree.points.device)
+    _start(launcher, "pc_mean_distances", _FEW[2:], tree, k, tree.points, tree.ptr, tree.order, None, mean)
+    return mean
+
+
 def searched(
     launcher: Launcher,
     tree: BoxTree,
@@ -91,29 +122,40 @@ def searched(
     queries_ptr: Tensor | None = None,
     radius: float | Tensor | None = None,
     squared: bool = False,
-    means: bool = False,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Return rows (Q, k), distances or their squares (Q, k), and, instead of both, mean distances (Q,) float64."""
+) -> tuple[Tensor, Tensor]:
+    """Return rows (Q, k), and distances or their squares (Q, k)."""
     order, device = tree.order, tree.points.device
     if queries is None or queries_ptr is None:
         queries, queries_ptr = tree.points, tree.ptr
     else:
         queries, queries_ptr = queries.detach().contiguous(), queries_ptr.contiguous()
         order = in_order(launcher, queries, queries_ptr, tree.box)
-    count, width = len(queries), 0 if means else k
-    index = torch.empty((count, width), dtype=torch.int64, device=device)
-    told = torch.empty((count, width), dtype=torch.float32, device=device)
-    mean = torch.empty(count if means else 0, dtype=torch.float64, device=device)
-    limits = largest_squared(radius, device).contiguous() if isinstance(radius, Tensor) else None
+    index = torch.empty((len(queries), k), dtype=torch.int64, device=device)
+    told = torch.empty((len(queries), k), dtype=torch.float32, device=device)
+    results = len(tree.points), index, told, int(squared)
+    _start(launcher, "pc_nearest", _FEW, tree, k, queries, queries_ptr, order, radius, *results)
+    return index, told
+
+
+def _start(
+    launcher: Launcher,
+    kind: str,
+    sizes: Sequence[int],
+    tree: BoxTree,
+    k: int,
+    queries: Tensor,
+    queries_ptr: Tensor,
+    order: Tensor,
+    radius: float | Tensor | None,
+    *results: Any,
+) -> None:
+    """Search with the kernel that keeps the fewest neighbors to itself, and enough."""
+    of_each = isinstance(radius, Tensor)
+    limits = largest_squared(radius, tree.points.device).contiguous() if of_each else None
     limit = float(largest_squared(None if isinstance(radius, Tensor) else radius, torch.device("cpu")))
-    most = next((str(few) for few in _FEW if k <= few), "many")
-    if means and most == "many":
-        raise ValueError(f"means are of at most {_FEW[-1]} neighbors, not {k}; please report this")
     launcher.launch(
-        f"pc_nearest_{most}",
-        *(count, queries, queries_ptr, order, tree.ptr, len(tree.ptr) - 1, count, k, limit, limits),
-        *(tree.placed, len(tree.points), tree.sides, tree.least_rows, tree.nodes),
-        *(len(tree.points), index, told, int(squared), mean if means else None),
+        f"{kind}_{next((size for size in sizes if k <= size), 'many')}",
+        *(len(queries), queries, queries_ptr, order, tree.ptr, len(tree.ptr) - 1, len(queries), k, limit, limits),
+        *(tree.placed, len(tree.points), tree.sides, tree.least_rows, tree.nodes, *results),
         block=_BLOCK,
     )
-    return index, told, mean

@@ -1,4 +1,4 @@
-"""Radius outliers: most points find enough neighbors beside them in memory, the rest looks into cells."""
+"""Outliers: by the mean distance to the nearest, and by the number of neighbors within a radius."""
 
 from __future__ import annotations
 
@@ -11,7 +11,11 @@ from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.radius import squared_radius
 from pcdata.kernels.cuda.cells import MOST_ROWS, cell_table, hold_to_extent
 from pcdata.kernels.cuda.launching import launcher_of
+from pcdata.kernels.cuda.neighbors import mean_distances, reachable
+from pcdata.kernels.cuda.trees import box_tree
 
+_MOST_NEIGHBORS = 64  # that a thread keeps to itself
+_RUNS = 1024  # threads of a block, kRuns of the kernel
 _REACH = 32  # rows looked at on either side
 
 
@@ -41,4 +45,21 @@ def radius_outlier_mask(
         *(table.counts, table.ends, table.placed, limit, enough, undecided, count, table.place_of, outlier),
     )
     hold_to_extent("radius_outlier_mask", points, ptr, radius, table.far)
+    return outlier
+
+
+@kernel("statistical_outlier_mask", "cuda")
+def statistical_outlier_mask(
+    points: Tensor, ptr: Tensor, num_neighbors: int, std_ratio: float, grid: ImageGrid | None
+) -> Tensor:
+    """Average distances where neighbors are found; nothing waits for the device."""
+    k = reachable(num_neighbors, points)
+    if k > _MOST_NEIGHBORS or len(points) > MOST_ROWS:
+        reference = OPERATIONS["statistical_outlier_mask"].reference
+        fallen: Tensor = reference(points, ptr, num_neighbors=num_neighbors, std_ratio=std_ratio, backend="cuda")
+        return fallen
+    launcher = launcher_of(points)
+    mean = mean_distances(launcher, box_tree(launcher, points, ptr), k)
+    outlier = torch.empty(len(points), dtype=torch.bool, device=points.device)
+    launcher.launch_blocks("pc_mark_unusual", len(ptr) - 1, mean, ptr, float(std_ratio), outlier, block=_RUNS)
     return outlier

@@ -95,3 +95,21 @@ def test_a_search_never_waits_for_the_device(monkeypatch):
         F.knn(points, ptr, k=4)
     assert [place for place in watched.waits if "kernels/cuda" in place] == []
     assert watched.launches < 30
+
+
+@pytest.mark.parametrize(("radius", "most"), [(0.01, 30), (3.0, 12), (None, 5), (0.5, 64), (0.5, 65), (1e-6, 30)])
+def test_normals(radius, most, ordered):
+    points, ptr = cloud(400), torch.tensor([0, 0, 200, 202, 400])
+    options = {"radius": radius, "max_neighbors": most}
+    found = F.estimate_normals(points, ptr, **options, backend=harness.BACKEND)
+    torch.testing.assert_close(found, F.estimate_normals(points, ptr, **options, backend="torch"), atol=2e-6, rtol=0)
+
+
+def test_means_that_are_all_equal_are_told_apart_as_by_the_reference(ordered):
+    turns = torch.arange(3000.0) * (2 * torch.pi / 3000)
+    ring = torch.stack([turns.cos(), turns.sin(), torch.zeros(3000)], 1)
+    lattice = torch.cartesian_prod(*[torch.arange(11.0)] * 3)
+    for points, ptr in ((ring, [0, 3000]), (lattice, [0, 1331]), (torch.cat([ring, lattice]), [0, 3000, 4331])):
+        options = {"num_neighbors": 3, "std_ratio": 1e-9}
+        found = F.statistical_outlier_mask(points, torch.tensor(ptr), **options, backend=harness.BACKEND)
+        assert torch.equal(found, F.statistical_outlier_mask(points, torch.tensor(ptr), **options, backend="torch"))

@@ -69,6 +69,8 @@ def test_every_kernel_is_run_by_some_operation():
         ran |= set(launcher.started)
     launcher = harness.use(0)
     F.knn(torch.rand(1100, 3), k=1, backend=harness.BACKEND)  # parents of leaves
+    F.statistical_outlier_mask(torch.rand(90, 3), num_neighbors=40, backend=harness.BACKEND)
+    F.estimate_normals(torch.rand(90, 3), max_neighbors=40, backend=harness.BACKEND)
     F.farthest_point_sample(torch.rand(33_000, 3), num_samples=2, backend=harness.BACKEND)  # all blocks for one cloud
     ran |= set(launcher.started)
     assert ran == set(harness.kernel_names())

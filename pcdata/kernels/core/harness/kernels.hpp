@@ -8,4 +8,5 @@
 #include "pc/gpu/nearest.hpp"
 #include "pc/gpu/planes.hpp"
 #include "pc/gpu/radius.hpp"
+#include "pc/gpu/unusual.hpp"
 #include "pc/gpu/voxels.hpp"

@@ -73,18 +73,19 @@ struct MeanDistance {
   }
 };
 
-// The sum of body(0), body(1), ... in eight interleaved runs, then these in order; the reference adds in this order
-// too, since the mask hangs on the last bit where all means are equal.
+// The sum of body(0), body(1), ... in interleaved runs, halves of which are then added to each other; the reference
+// adds in this order too, since the mask hangs on the last bit where all means are equal.
 template <class Body>
 double interleaved_sum(int64_t count, Body&& body) {
-  double run[8] = {};
+  constexpr int64_t kRuns = 1024;
+  double run[kRuns] = {};
   int64_t i = 0;
-  for (; i + 8 <= count; i += 8)
-    for (int lane = 0; lane < 8; ++lane) run[lane] += body(i + lane);
-  for (; i < count; ++i) run[i % 8] += body(i);
-  double sum = 0;
-  for (const double part : run) sum += part;
-  return sum;
+  for (; i + kRuns <= count; i += kRuns)
+    for (int64_t lane = 0; lane < kRuns; ++lane) run[lane] += body(i + lane);
+  for (int64_t lane = 0; i + lane < count; ++lane) run[lane] += body(i + lane);
+  for (int64_t half = kRuns / 2; half > 0; half /= 2)
+    for (int64_t lane = 0; lane < half; ++lane) run[lane] += run[lane + half];
+  return run[0];
 }
 
 void mark_outliers(const double* mean, int64_t count, double std_ratio, bool* outlier) {

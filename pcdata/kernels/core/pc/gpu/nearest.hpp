@@ -7,6 +7,7 @@
 #pragma once
 
 #include "pc/gpu/box_tree.hpp"
+#include "pc/math/normal.hpp"
 
 namespace pc::gpu {
 
@@ -172,100 +173,167 @@ PC_HD void search(const Tree& tree, const Query& query, Keys& keys) {
   }
 }
 
-// Queries in their order, and what is to be told of each.
-struct Task {
-  const float* queries;        // (Q, 3)
-  const int64_t* query_ptr;    // (clouds + 1)
-  const int64_t* query_order;  // (Q): the rows of queries in the order of the points
-  const int64_t* ptr;          // (clouds + 1), of the points
-  int64_t clouds, count, k;
+// Queries in their order, and what they look for.
+struct Queries {
+  const float* points;   // (Q, 3)
+  const int64_t* ptr;    // (clouds + 1)
+  const int64_t* order;  // (Q): rows in the order of the points
+  int64_t count, clouds;
+  const int64_t* points_ptr;  // (clouds + 1), of the points that are searched
+  int64_t k;
   double limit;         // of squared distances, inclusive
   const float* limits;  // (Q), or null: the same for each query
-  int64_t missing;      // what stands for the row of no neighbor
-  int64_t* index;       // (Q, k), or null
-  float* told;          // (Q, k) distances, or their squares
-  int64_t squared;      // whether it is their squares
-  double* mean;         // (Q): the mean distance, or null
 
-  PC_HD int64_t place() const { return thread_index(); }
+  PC_HD bool is_one() const { return thread_index() < count; }
+  PC_HD int64_t row() const { return order[thread_index()]; }
   PC_HD Query query() const {
-    if (place() >= count) return {0, 0, 0, 0, 0, 0};
-    const int64_t row = query_order[place()], cloud = cloud_of(query_ptr, clouds, row);
-    const float* p = queries + 3 * row;
-    const float most = limits == nullptr ? static_cast<float>(limit) : limits[row];
-    return {p[0], p[1], p[2], ptr[cloud], ptr[cloud + 1], key_of(most, -1)};
-  }
-  template <class Keys>
-  PC_HD void tell(Keys& keys) const {
-    if (place() >= count) return;
-    const int64_t row = query_order[place()];
-    keys.finish();
-    double sum = 0, found = 0;
-    for (int64_t i = 0; i < k; ++i) {
-      const uint64_t key = keys.at(i);
-      const bool is_found = key != kNoKey;
-      const float distance2 = is_found ? squared_of(key) : float_of(0x7F800000u);
-      if (mean != nullptr) {
-        if (is_found) {
-          sum += sqrt(static_cast<double>(distance2));
-          found += 1;
-        }
-        continue;
-      }
-      index[row * k + i] = is_found ? row_of(key) : missing;
-      told[row * k + i] = squared ? distance2 : static_cast<float>(sqrt(static_cast<double>(distance2)));
-    }
-    if (mean != nullptr) mean[row] = sum / found;
+    if (!is_one()) return {0, 0, 0, 0, 0, 0};
+    const int64_t cloud = cloud_of(ptr, clouds, row());
+    const float* p = points + 3 * row();
+    const float most = limits == nullptr ? static_cast<float>(limit) : limits[row()];
+    return {p[0], p[1], p[2], points_ptr[cloud], points_ptr[cloud + 1], key_of(most, -1)};
   }
 };
+
+PC_HD float rooted(float squared) { return static_cast<float>(sqrt(static_cast<double>(squared))); }
+
+// Writes rows and distances, or the squares of these; beyond the last neighbor `missing` and infinity.
+struct Neighbors {
+  int64_t k, missing;
+  int64_t* index;  // (Q, k)
+  float* told;     // (Q, k)
+  bool squares;
+
+  template <class Keys>
+  PC_HD void operator()(const Keys& keys, int64_t row, const Query&) const {
+    for (int64_t i = 0; i < k; ++i) {
+      const uint64_t key = keys.at(i);  // which may lie where the index goes
+      const bool is_found = key != kNoKey;
+      const float squared = is_found ? squared_of(key) : float_of(0x7F800000u);
+      index[row * k + i] = is_found ? row_of(key) : missing;
+      told[row * k + i] = squares ? squared : rooted(squared);
+    }
+  }
+};
+
+// Writes the mean distance.
+struct MeanDistance {
+  int64_t k;
+  double* mean;  // (Q)
+
+  template <class Keys>
+  PC_HD void operator()(const Keys& keys, int64_t row, const Query&) const {
+    double sum = 0;
+    int64_t found = 0;
+    for (; found < k && keys.at(found) != kNoKey; ++found)
+      sum += static_cast<double>(rooted(squared_of(keys.at(found))));
+    mean[row] = sum / static_cast<double>(found);
+  }
+};
+
+// Writes the direction in which the neighbors vary least.
+struct Normal {
+  int64_t k;
+  const float* points;  // (N, 3), that are searched
+  float* normals;       // (Q, 3)
+
+  template <class Keys>
+  PC_HD void operator()(const Keys& keys, int64_t row, const Query& query) const {
+    math::Moments m{0, 0, 0, 0, {0, 0, 0, 0, 0, 0}};
+    for (int64_t i = 0; i < k && keys.at(i) != kNoKey; ++i) {
+      const float* p = points + 3 * static_cast<int64_t>(row_of(keys.at(i)));
+      const double x = static_cast<double>(p[0]) - static_cast<double>(query.x),
+                   y = static_cast<double>(p[1]) - static_cast<double>(query.y),
+                   z = static_cast<double>(p[2]) - static_cast<double>(query.z);
+      m.count += 1;
+      m.x += x;
+      m.y += y;
+      m.z += z;
+      m.square.xx += x * x;
+      m.square.xy += x * y;
+      m.square.xz += x * z;
+      m.square.yy += y * y;
+      m.square.yz += y * z;
+      m.square.zz += z * z;
+    }
+    const math::Vector3 normal = math::normal_of(m);
+    normals[3 * row] = static_cast<float>(normal.x);
+    normals[3 * row + 1] = static_cast<float>(normal.y);
+    normals[3 * row + 2] = static_cast<float>(normal.z);
+  }
+};
+
+template <class Keys, class Tell>
+PC_HD void find(const Tree& tree, const Queries& queries, Keys& keys, const Tell& tell) {
+  const Query query = queries.query();
+  search(tree, query, keys);
+  if (!queries.is_one()) return;
+  keys.finish();
+  tell(keys, queries.row(), query);
+}
+
+template <int kMost, class Tell>
+PC_HD void find_few(const Tree& tree, const Queries& queries, const Tell& tell) {
+  FewKeys<kMost> keys;
+  keys.start(queries.k);
+  find(tree, queries, keys, tell);
+}
 
 #define PC_SEARCH_PARAMETERS                                                                                          \
   const float *queries, const int64_t *query_ptr, const int64_t *query_order, const int64_t *ptr, int64_t clouds,     \
       int64_t count, int64_t k, double limit, const float *limits, const float *placed, int64_t points, float *sides, \
-      int32_t *least_rows, int64_t nodes, int64_t missing, int64_t *index, float *told, int64_t squared, double *mean
-#define PC_SEARCH_TASK                                                            \
-  const Task task{queries, query_ptr, query_order, ptr,   clouds, count,   k,     \
-                  limit,   limits,    missing,     index, told,   squared, mean}; \
-  const Tree tree {                                                               \
-    reinterpret_cast<const Placed*>(placed), points, { sides, least_rows, nodes } \
+      int32_t *least_rows, int64_t nodes
+#define PC_SEARCH                                                                             \
+  const Queries asked{queries, query_ptr, query_order, count, clouds, ptr, k, limit, limits}; \
+  const Tree tree {                                                                           \
+    reinterpret_cast<const Placed*>(placed), points, { sides, least_rows, nodes }             \
   }
 
-template <int kMost>
-PC_HD void find_few(const Tree& tree, const Task& task) {
-  FewKeys<kMost> keys;
-  keys.start(task.k);
-  search(tree, task.query(), keys);
-  task.tell(keys);
+// Neighbors, for up to so many of them.
+#define PC_NEAREST_PARAMETERS PC_SEARCH_PARAMETERS, int64_t missing, int64_t *index, float *told, int64_t squares
+PC_BLOCK_KERNEL(pc_nearest_8, PC_NEAREST_PARAMETERS) {
+  PC_SEARCH;
+  find_few<8>(tree, asked, Neighbors{k, missing, index, told, squares != 0});
 }
-
-// For up to so many neighbors.
-PC_BLOCK_KERNEL(pc_nearest_8, PC_SEARCH_PARAMETERS) {
-  PC_SEARCH_TASK;
-  find_few<8>(tree, task);
+PC_BLOCK_KERNEL(pc_nearest_16, PC_NEAREST_PARAMETERS) {
+  PC_SEARCH;
+  find_few<16>(tree, asked, Neighbors{k, missing, index, told, squares != 0});
 }
-PC_BLOCK_KERNEL(pc_nearest_16, PC_SEARCH_PARAMETERS) {
-  PC_SEARCH_TASK;
-  find_few<16>(tree, task);
+PC_BLOCK_KERNEL(pc_nearest_32, PC_NEAREST_PARAMETERS) {
+  PC_SEARCH;
+  find_few<32>(tree, asked, Neighbors{k, missing, index, told, squares != 0});
 }
-PC_BLOCK_KERNEL(pc_nearest_32, PC_SEARCH_PARAMETERS) {
-  PC_SEARCH_TASK;
-  find_few<32>(tree, task);
-}
-PC_BLOCK_KERNEL(pc_nearest_64, PC_SEARCH_PARAMETERS) {
-  PC_SEARCH_TASK;
-  find_few<64>(tree, task);
+PC_BLOCK_KERNEL(pc_nearest_64, PC_NEAREST_PARAMETERS) {
+  PC_SEARCH;
+  find_few<64>(tree, asked, Neighbors{k, missing, index, told, squares != 0});
 }
 
 // For any number: `index` holds the keys until they are told.
-PC_BLOCK_KERNEL(pc_nearest_many, PC_SEARCH_PARAMETERS) {
-  PC_SEARCH_TASK;
-  const bool is_one = task.place() < count;
-  // A lane without a query has room for one key, which nothing reads.
-  uint64_t nothing = kNoKey;
-  ManyKeys keys{is_one ? reinterpret_cast<uint64_t*>(index) + query_order[task.place()] * k : &nothing, is_one ? k : 1};
+PC_BLOCK_KERNEL(pc_nearest_many, PC_NEAREST_PARAMETERS) {
+  PC_SEARCH;
+  uint64_t nothing = kNoKey;  // the room of a lane without a query
+  ManyKeys keys{asked.is_one() ? reinterpret_cast<uint64_t*>(index) + asked.row() * k : &nothing,
+                asked.is_one() ? k : 1};
   keys.start(keys.wanted);
-  search(tree, task.query(), keys);
-  task.tell(keys);
+  find(tree, asked, keys, Neighbors{k, missing, index, told, squares != 0});
+}
+
+PC_BLOCK_KERNEL(pc_mean_distances_32, PC_SEARCH_PARAMETERS, double* mean) {
+  PC_SEARCH;
+  find_few<32>(tree, asked, MeanDistance{k, mean});
+}
+PC_BLOCK_KERNEL(pc_mean_distances_64, PC_SEARCH_PARAMETERS, double* mean) {
+  PC_SEARCH;
+  find_few<64>(tree, asked, MeanDistance{k, mean});
+}
+
+PC_BLOCK_KERNEL(pc_normals_32, PC_SEARCH_PARAMETERS, float* normals) {
+  PC_SEARCH;
+  find_few<32>(tree, asked, Normal{k, queries, normals});
+}
+PC_BLOCK_KERNEL(pc_normals_64, PC_SEARCH_PARAMETERS, float* normals) {
+  PC_SEARCH;
+  find_few<64>(tree, asked, Normal{k, queries, normals});
 }
 
 }  // namespace pc::gpu
