@@ -70,8 +70,7 @@ def declared(text: str, theme: str) -> list[Kernel]:
     """
     text = re.sub(r"//[^\n]*", "", text)
     for name, parameters in reversed(_DEFINED.findall(text)):  # that several kernels share
-        shared = parameters.replace("\\", " ")
-        text = re.sub(rf"(?<!#define )\b{name}\b", lambda _, shared=shared: shared, text)
+        text = re.sub(rf"(?<!#define )\b{name}\b", parameters.replace("\\", " "), text)
     return [
         Kernel(name, theme, KINDS[kind], tuple(_parameter(name, one) for one in listed.split(",")))
         for kind, name, listed in _KERNEL.findall(text)

@@ -78,14 +78,16 @@ struct MeanDistance {
 template <class Body>
 double interleaved_sum(int64_t count, Body&& body) {
   constexpr int64_t kRuns = 1024;
-  double run[kRuns] = {};
+  const int64_t runs = std::min(count, kRuns);  // the others are 0, and adding 0 changes nothing
+  double run[kRuns];
+  std::fill(run, run + runs, 0.0);
   int64_t i = 0;
   for (; i + kRuns <= count; i += kRuns)
     for (int64_t lane = 0; lane < kRuns; ++lane) run[lane] += body(i + lane);
   for (int64_t lane = 0; i + lane < count; ++lane) run[lane] += body(i + lane);
   for (int64_t half = kRuns / 2; half > 0; half /= 2)
-    for (int64_t lane = 0; lane < half; ++lane) run[lane] += run[lane + half];
-  return run[0];
+    for (int64_t lane = 0; lane < std::min(half, runs - half); ++lane) run[lane] += run[lane + half];
+  return runs > 0 ? run[0] : 0.0;
 }
 
 void mark_outliers(const double* mean, int64_t count, double std_ratio, bool* outlier) {
