@@ -27,6 +27,8 @@ MAX_REFINEMENTS = 20
 _PLANES, _POINTS = 64, 4096
 # Hypotheses of the first look where few may do; as many again as there were after each.
 _FIRST_TRIES = 64
+# Points that hypotheses are scored on where they need not be the best of all: their shares are off by 0.4 % or less.
+_SCORED = 1 << 14
 # Planes drawn at a time, over all clouds: 32 MB.
 _MOST_HYPOTHESES = 1 << 20
 
@@ -221,9 +223,9 @@ def ransac_plane(
 ) -> tuple[Tensor, Tensor]:  # planes (B, 4) float64, inlier_mask (N,) bool
     """Find each cloud's plane with the most points nearer than ``distance`` (strictly, as Open3D).
 
-    A plane is (nx, ny, nz, d) with a unit normal and n.p + d = 0. Every hypothesis is scored on all points; ties go to
-    the earliest. The winner is then refitted to its inliers by least squares until the inliers no
-    longer change (at most 20 rounds).
+    A plane is (nx, ny, nz, d) with a unit normal and n.p + d = 0. Every hypothesis is scored, without ``probability`` on
+    all points; ties go to the earliest. The winner is then refitted to its inliers by least squares until the inliers
+    no longer change (at most 20 rounds).
 
     ``inlier_mask`` is ``|((nx*x + ny*y) + nz*z) + d| < distance`` in float32, with the plane rounded to float32.
     The normal points along ``up`` when given, else toward the origin, where the sensor is (d >= 0). A plane nearer to
@@ -240,7 +242,9 @@ def ransac_plane(
             leave this cone is not taken.
         probability: stop at the first hypothesis by which, if the best so far holds the share w of the points, three
             points within that plane have been drawn with this probability: after log(1 - probability) /
-            log(1 - w^3) tries. Hypotheses count in the order drawn, so every backend stops at the same. None = try all.
+            log(1 - w^3) tries. Hypotheses count in the order drawn, so every backend stops at the same. They are scored
+            on 16,384 points at most, one out of each of as many equal stretches of the cloud (on all where no plane has
+            3 of those); the winner is refitted to all. None = try all.
         guess: (B, 4) planes that compete before those drawn, such as those of the frame before; NaN = none. They are
             scored like the others, so a wrong one loses and changes nothing; they are not counted as tries.
         backend: which body to run; see :mod:`pcdata.contracts.dispatch`.
@@ -270,38 +274,55 @@ def ransac_plane(
         is_plane = ~hypotheses[..., 0].isnan()
         competes = is_plane & within_tilt(hypotheses, None if up is None else up[some, None], max_tilt)
         runs = bound_runs(own, own_ptr, backend=backend)
-        near = _count_until_probable(
-            own,
-            own_ptr,
-            runs,
-            hypotheses,
-            competes,
-            distance,
-            probability,
-            backend,
-            hypotheses.shape[1] - num_hypotheses,
-        )
+        if probability is None:
+            floors = torch.zeros(len(own_ptr) - 1, dtype=torch.int64, device="cpu")
+            near = record_planes(own, own_ptr, runs, hypotheses, competes, distance, floors, backend=backend)
+        else:
+            not_drawn = hypotheses.shape[1] - num_hypotheses
+            search = distance, probability, backend, not_drawn
+            near = _count_until_probable(*spread_points(own, own_ptr, _SCORED), hypotheses, competes, *search)
+            for b in (near.amax(1) < 3).nonzero().squeeze(1).tolist():
+                alone = _clouds_between(own, own_ptr, b, b + 1)
+                near[b] = _count_until_probable(*alone, hypotheses[b : b + 1], competes[b : b + 1], *search)[0]
         winners.append(_best_planes(hypotheses, is_plane, competes, near, distance, first))
     runs = runs if at_once >= num_clouds else ()  # of all clouds
     planes, inliers = refine_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, runs, backend=backend)
     return _face(planes, up, distance).to(points.device), inliers
 
 
+def spread_points(points: Tensor, ptr: Tensor, most: int) -> tuple[Tensor, Tensor]:
+    """Return ``most`` points (M, 3) of each cloud that has more, and its ptr: one out of each of as many stretches.
+
+    Which one of a stretch follows no period, so rows and columns of images are met alike. Steps of the golden ratio
+    fill an interval evenly: Weyl's sequence, as in Knuth, The Art of Computer Programming, volume 3, section 6.4.
+    """
+    bounds = list(pairwise(ptr.tolist()))
+    if all(stop - start <= most for start, stop in bounds):
+        return points, ptr
+    number = torch.arange(most, dtype=torch.int64, device=points.device)
+    part = number * 2654435769 & 0xFFFFFFFF  # of 2^32
+    chosen = []
+    for start, stop in bounds:
+        if stop - start <= most:
+            chosen.append(points[start:stop])
+            continue
+        first, after = (at * (stop - start) // most for at in (number, number + 1))
+        chosen.append(points[start + first + (part * (after - first) >> 32)])
+    return torch.cat(chosen), ptr_from_counts([len(one) for one in chosen], device=ptr.device)
+
+
 def _count_until_probable(
     points: Tensor,
     ptr: Tensor,
-    runs: tuple[Tensor, ...],
     hypotheses: Tensor,  # (B, P, 4)
     competes: Tensor,  # (B, P)
     distance: float,
-    probability: float | None,
+    probability: float,
     backend: str,
     not_drawn: int,  # of the first planes
 ) -> Tensor:  # counts (B, P) of the planes that were the best so far; 0 of others and behind each cloud's last try
     """Score hypotheses, in blocks where few may do, until the last cloud has been tried often enough."""
     floors = torch.zeros(len(ptr) - 1, dtype=torch.int64, device="cpu")
-    if probability is None:
-        return record_planes(points, ptr, runs, hypotheses, competes, distance, floors, backend=backend)
     sizes = counts_from_ptr(ptr).cpu()[:, None].double()
     counts = torch.zeros(competes.shape, dtype=torch.int64, device="cpu")
     tries, first, block = hypotheses.shape[1], 0, _FIRST_TRIES
@@ -309,7 +330,7 @@ def _count_until_probable(
     while first < tries and bool((last > first).any()):
         some = slice(first, min(first + block, tries))
         part, asked = hypotheses[:, some].contiguous(), competes[:, some] & (last > first)
-        counts[:, some] = record_planes(points, ptr, runs, part, asked, distance, floors, backend=backend)
+        counts[:, some] = record_planes(points, ptr, (), part, asked, distance, floors, backend=backend)
         best = torch.maximum(counts[:, some].cummax(1).values, floors[:, None])
         # log1p(-1) = -inf: one try finds a plane that holds all
         needed = math.log1p(-probability) / torch.log1p(-(best / sizes).pow(3))

@@ -67,7 +67,8 @@ class RemovePlane(RemoveTransform):
         seed: of the hypotheses: the same cloud always gives the same plane.
         which: the plane with the most inliers, or the one that things stand on.
         cut: drop a slab of ``distance`` on both sides, or what the plane's own bend and noise explain.
-        probability: stop trying once a better plane is this unlikely to be missed; None = try all.
+        probability: stop trying once a better plane is this unlikely to be missed, and score tries on 16,384 points;
+            None = try all, on all.
         up: the normal's rough direction in `frame`; None = any, facing the sensor or the origin of the frame.
         frame: the frame that `up` is given in; given with it.
         max_tilt: radians between normal and up at most.
@@ -86,7 +87,7 @@ class RemovePlane(RemoveTransform):
 
     runs_statistics = True
     decides_by = "point"  # but over the hull of the rows near the plane, and where their noise is measured
-    version = 6
+    version = 7
 
     distance: Metres = 0.01
     num_hypotheses: Count = 1000

@@ -130,6 +130,49 @@ def test_a_guess_is_scored_like_any_other(probability):
     assert angle_to(tilted[0], up.tolist()) <= 0.5 + 1e-9
 
 
+def large_scene() -> torch.Tensor:
+    """More points than are scored under a probability, row by row of an image 848 wide."""
+    v, u = torch.meshgrid(torch.arange(100) / 100, torch.arange(848) / 848, indexing="ij")
+    table = torch.stack([u, v, 1 + 0.1 * u + 0.002 * torch.sin(300 * u * v)], dim=-1)
+    table[:, 600:, 2] -= torch.rand(100, 248, generator=seeded(5))
+    return table.reshape(-1, 3)
+
+
+@pytest.mark.parametrize("backend", ["auto", "torch"])
+def test_a_search_on_some_points_finds_the_plane_of_all(backend):
+    points = large_scene()
+    expected, inliers = ransac_plane(points)
+    planes, mask = ransac_plane(points, probability=0.9999, backend=backend)
+    assert torch.equal(mask, inliers)
+    torch.testing.assert_close(planes, expected, rtol=0, atol=1e-9)
+    small = scene()
+    both, masks = ransac_plane(torch.cat([points, small]), torch.tensor([0, 84_800, 85_800]), probability=0.9999)
+    assert torch.equal(masks[:84_800], mask)
+    assert torch.equal(both[1:], ransac_plane(small, probability=0.9999)[0])
+
+
+def test_points_that_are_scored_are_spread_over_rows_and_columns():
+    counts = torch.tensor([848 * 480, 5, 64 * 16_384])
+    ptr = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
+    rows = torch.arange(int(ptr[-1]), dtype=torch.float64)[:, None].expand(-1, 3)
+    chosen, chosen_ptr = planes_module.spread_points(rows, ptr, 16_384)
+    assert chosen_ptr.tolist() == [0, 16_384, 16_389, 32_773]
+    assert bool((chosen[1:, 0] > chosen[:-1, 0]).all())
+    for own, width in ((chosen[:16_384, 0], 848), (chosen[16_389:, 0] - float(ptr[2]), 64)):
+        columns = torch.bincount(own.long() % width, minlength=width)
+        assert int(columns.min()) > 0.5 * 16_384 / width
+        assert int(columns.max()) < 2 * 16_384 / width
+
+
+def test_a_plane_of_fewer_points_than_the_scored_ones_show_is_found_still():
+    points = torch.rand((60_000, 3), generator=seeded(3))
+    some, ptr = planes_module.spread_points(points, torch.tensor([0, 60_000]), 16_384)
+    hypotheses = planes_through(points[draw_rows(60_000, 3, 20, seeded(0))])
+    assert int((plane_distance(some, hypotheses).abs() < 1e-7).sum(1).max()) < 3
+    _, inliers = ransac_plane(points, distance=1e-7, probability=0.9, num_hypotheses=20)
+    assert int(inliers.sum()) >= 3
+
+
 def test_hypotheses_beyond_the_tilt_are_never_scored(monkeypatch):
     scored = []
     monkeypatch.setattr(planes_module, "_count_near", lambda points, planes, distance: _kept(scored, points, planes))

@@ -314,7 +314,7 @@ def test_runs_of_points_change_no_count(order, scale, machine):
 
 @pytest.mark.parametrize("order", ["image", "shuffled", "sorted", "line"])
 def test_refinement_equals_the_reference(order, machine):
-    """Of large and small clouds, whatever their order says of the points, with any number of threads."""
+    """Of large and small clouds, whatever their order says of the points."""
     from pcdata.functional import planes
 
     points, generator = organized(130, 170), seeded(2)
@@ -335,11 +335,9 @@ def test_refinement_equals_the_reference(order, machine):
     up = torch.nn.functional.normalize(torch.tensor([[0.1, 0.2, -1.0]], dtype=torch.float64)).repeat(len(counts), 1)
     for distance, max_tilt in ((0.02, None), (0.005, None), (0.02, 0.3), (1e-5, None)):
         arguments = points, ptr, begun, distance, None if max_tilt is None else up, max_tilt
-        expected = planes.refine_planes(*arguments, backend="torch")
+        expected = reference_of((order, distance, max_tilt), planes.refine_planes, *arguments)
         found = [planes.refine_planes(*arguments, backend="cpu")]
-        for threads in (1, 2):
-            torch.set_num_threads(threads)
-            found.append(planes.refine_planes(*arguments, planes.bound_runs(points, ptr, backend="cpu"), backend="cpu"))
+        found.append(planes.refine_planes(*arguments, planes.bound_runs(points, ptr, backend="cpu"), backend="cpu"))
         for own_planes, inliers in found:
             assert torch.equal(own_planes, found[0][0])
             assert torch.equal(inliers, expected[1])
