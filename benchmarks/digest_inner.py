@@ -28,7 +28,7 @@ from torch import Tensor
 Arguments = tuple[tuple[Any, ...], dict[str, Any]]
 
 
-NO_RUNS = torch.zeros(3, dtype=torch.int64), torch.empty(8, 0), torch.empty(3, 0)  # of two small clouds
+NO_RUNS = torch.zeros(3, dtype=torch.int64), torch.empty(8, 0)  # of two small clouds
 
 
 def _fields() -> dict[str, Tensor]:
@@ -190,6 +190,11 @@ def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     yield "hull_rows", "two", lambda: ((cloud[:, :2].double(),), {})
     places = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 0.9]], dtype=torch.float64)
     yield "reaches", "two", lambda: ((cloud, ptr, places, 0.01), {})
+    seen, leaning = cloud[:, 2] > 0.05, torch.tensor([0.6, 0.0, 0.8, -0.05], dtype=torch.float64)
+    axes = torch.tensor([[0.0, 1.0, 0.0], [-0.8, 0.0, 0.6]], dtype=torch.float64)
+    yield "outline_rows", "two", lambda: ((cloud, seen, leaning, axes), {})
+    checkered = (torch.arange(6)[:, None] + torch.arange(5)) % 2 == 0
+    yield "points_in_cells", "two", lambda: ((cloud, seen, axes, torch.zeros(2).double(), 30.0, checkered), {})
     level, ones = torch.tensor([0.0, 0.0, 1.0, -0.05], dtype=torch.float64), torch.ones(126, dtype=torch.float64)
     yield "fit_surface", "level", lambda: ((cloud, ones, level, 0.03, "digest"), {})
     jaw = ParallelJaw(

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 import torch
 from torch import Tensor
 
+from pcdata.contracts.dispatch import REFERENCE, inner
 from pcdata.functional.image_clusters import lowest_rows
-from pcdata.functional.selection import plane_axes
+from pcdata.functional.selection import hull_rows, plane_axes
 
 _MOST_POINTS = 1 << 14  # that tell where the surface is
 _REACH = 5  # distances from the plane that tell whether something crosses it
@@ -40,14 +39,14 @@ def plane_patch(
     own = own[around]
     if not bool(own.any()):
         return near
-    places = [points @ axis.to(points.dtype) for axis in plane_axes(plane).T]
-    flat = torch.stack([along[::stride][around] for along in places])
+    axes = plane_axes(plane).T.cpu().contiguous()
+    flat = _flat(points[::stride][around], axes)
     low, high = flat.amin(1), flat.amax(1)
     span = float((high - low).max())
     edge = max(_CELL * distance, span / _MOST_CELLS)
     while True:
         size = [int(cells) + 5 for cells in ((high - low) / edge).tolist()]
-        cell = _cells(flat, low, edge, size)
+        cell = _cells(flat, low, 1 / edge, size)
         count = torch.bincount(cell[own], minlength=size[0] * size[1])
         if int((count == 1).sum()) <= _MOST_LONELY * int((count > 0).sum()) or edge > span / 4:
             break
@@ -56,16 +55,65 @@ def plane_patch(
     usual = float((count * share).sum() / count.sum())
     kept = _large_patches(((count > 0) & (share >= _CROSSED * usual)).reshape(size))
     # Cells at its rim without any point of those that were looked at.
-    kept = (kept | (_grown(kept) & (count == 0).reshape(size))).reshape(-1)
-    if stride == 1 and bool(kept[cell[own]].all()):
+    kept |= _grown(kept) & (count == 0).reshape(size)
+    if stride == 1 and bool(kept.reshape(-1)[cell[own]].all()):
         return near
-    return near & kept.index_select(0, _cells(places, low, edge, size))
+    return points_in_cells(points, near, axes, low.double().cpu(), 1 / edge, kept)
 
 
-def _cells(flat: Iterable[Tensor], low: Tensor, edge: float, size: list[int]) -> Tensor:
+@inner
+def points_in_cells(
+    points: Tensor,  # (n, 3) float32
+    chosen: Tensor,  # (n,) bool
+    axes: Tensor,  # (2, 3) float64 on the CPU: of the plane
+    low: Tensor,  # (2,) float64 on the CPU: where cells begin
+    scale: float,  # cells to a unit
+    cells: Tensor,  # (rows, columns) bool
+    *,
+    backend: str = "auto",
+) -> Tensor:  # (n,) bool
+    """Mark the chosen points that lie in marked cells."""
+    return chosen & cells.reshape(-1)[_cells(_flat(points, axes), low, scale, list(cells.shape))]
+
+
+@inner
+def outline_rows(
+    points: Tensor,  # (n, 3) float32
+    chosen: Tensor,  # (n,) bool
+    plane: Tensor,  # (4,) float64 on the CPU
+    axes: Tensor,  # (2, 3) float64 on the CPU: of the plane
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, float]:
+    """Return the rows (C,) of the corners of the chosen points' convex hull in a plane, and their RMS distance from it.
+
+    The corners are counterclockwise as seen from where the normal points to; the distance of no points is 0.
+    """
+    rows = chosen.nonzero().squeeze(1)
+    own = points[rows].double()
+    corners = rows[hull_rows(flat_places(own, axes), backend=REFERENCE)]
+    x, y, z = own.unbind(1)
+    a, b, c, d = plane.tolist()
+    off = ((x * a + y * b) + z * c) + d
+    return corners, float(off.square().mean().sqrt()) if len(own) else 0.0
+
+
+def flat_places(points: Tensor, axes: Tensor) -> Tensor:  # (n, 2) float64
+    """Return places in a plane, by separate operations: every backend gives the same bits."""
+    x, y, z = points.double().unbind(1)
+    return torch.stack([(x * a + y * b) + z * c for a, b, c in axes.tolist()], dim=1)
+
+
+def _flat(points: Tensor, axes: Tensor) -> Tensor:  # (2, n)
+    """Return places in the plane in the points' own dtype, likewise."""
+    x, y, z = points.unbind(1)
+    return torch.stack([(x * a + y * b) + z * c for a, b, c in axes.to(points.dtype).tolist()])
+
+
+def _cells(flat: Tensor, low: Tensor, scale: float, size: list[int]) -> Tensor:
     """Number the cells of places in the plane; beyond each end are two empty ones, the last for all farther away."""
     row, column = (
-        ((along - float(start)) / edge).floor_().add_(2).clamp_(0, cells - 1).int()
+        ((along - float(start)) * scale).floor_().add_(2).clamp_(0, cells - 1).int()
         for along, start, cells in zip(flat, low, size, strict=True)
     )
     return row * size[1] + column

@@ -223,9 +223,9 @@ def ransac_plane(
 ) -> tuple[Tensor, Tensor]:  # planes (B, 4) float64, inlier_mask (N,) bool
     """Find each cloud's plane with the most points nearer than ``distance`` (strictly, as Open3D).
 
-    A plane is (nx, ny, nz, d) with a unit normal and n.p + d = 0. Every hypothesis is scored, without ``probability`` on
-    all points; ties go to the earliest. The winner is then refitted to its inliers by least squares until the inliers
-    no longer change (at most 20 rounds).
+    A plane is (nx, ny, nz, d) with a unit normal and n.p + d = 0. Every hypothesis is scored, on all points unless
+    ``probability`` is given; ties go to the earliest. The winner is then refitted to its inliers by least squares until
+    the inliers no longer change (at most 20 rounds).
 
     ``inlier_mask`` is ``|((nx*x + ny*y) + nz*z) + d| < distance`` in float32, with the plane rounded to float32.
     The normal points along ``up`` when given, else toward the origin, where the sensor is (d >= 0). A plane nearer to

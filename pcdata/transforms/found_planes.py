@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -13,7 +12,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pcdata.functional.selection import hull_rows, plane_axes
+from pcdata.functional.plane_patch import flat_places, outline_rows
+from pcdata.functional.selection import plane_axes
 from pcdata.structures import PointCloud
 
 plane_guesses: ContextVar[tuple[Mapping[str, Any], ...]] = ContextVar("plane_guesses", default=())
@@ -83,38 +83,39 @@ def map_planes(planes: Tensor, old_from_new: Tensor) -> Tensor:
 
 
 def plane_facts(
-    own: Tensor,  # (n, 3) points of its surface
+    points: Tensor,  # (n, 3) of the cloud
+    surface: Tensor,  # (n,) bool: the points of its surface
     num_inliers: int,  # points near it, of walls that cross it too
-    num_points: int,  # of the cloud
     plane: Tensor,  # (4,) in the cloud's coordinates
     cloud: PointCloud,
     b: int,
 ) -> dict[str, Any]:
     """Return what is stored of one plane, in the source frame: itself, its share, its spread, and the hull of it."""
-    own, source_from_cloud = own.detach().double(), cloud.source_from_cloud[b]
+    points, plane, source_from_cloud = points.detach(), plane.cpu(), cloud.source_from_cloud[b].cpu()
     (source_plane,) = map_planes(plane[None], torch.linalg.inv(source_from_cloud)[None])
-    off = own @ plane[:3] + plane[3]
-    corners = hull_corners(own, plane)
+    corners, rms = hull_corners(points, surface, plane)
     moved = corners @ source_from_cloud[:3, :3].T + source_from_cloud[:3, 3]
     return {
         "normal": source_plane[:3].tolist(),
         "offset": float(source_plane[3]),
         "frame": cloud.source_frame,
         "num_inliers": num_inliers,
-        "inlier_share": num_inliers / max(num_points, 1),
-        "rms": math.sqrt(float(off.square().mean())) if len(own) else 0.0,
-        "hull": moved.cpu().numpy().round(_DIGITS).tolist(),
+        "inlier_share": num_inliers / max(len(points), 1),
+        "rms": rms,
+        "hull": moved.numpy().round(_DIGITS).tolist(),
     }
 
 
-def hull_corners(own: Tensor, plane: Tensor) -> Tensor:  # (C, 3) float64
-    """Return corners of the convex hull of points in a plane, moved onto it, without those that matter least."""
-    own = own.double()
-    flat = own @ plane_axes(plane)
-    rows = hull_rows(flat)
-    rows = rows[_most_corners(flat[rows].cpu().numpy())]
-    corners = own[rows]
-    return corners - (corners @ plane[:3] + plane[3])[:, None] * plane[:3]
+def hull_corners(points: Tensor, surface: Tensor, plane: Tensor) -> tuple[Tensor, float]:  # (C, 3) float64 on the CPU
+    """Return corners of the convex hull of points in a plane, moved onto it, without those that matter least.
+
+    And the RMS distance of the points from it.
+    """
+    axes = plane_axes(plane).T.contiguous()
+    rows, rms = outline_rows(points, surface, plane, axes)
+    corners = points[rows].double().cpu()
+    corners = corners[_most_corners(flat_places(corners, axes).numpy())]
+    return corners - (corners @ plane[:3] + plane[3])[:, None] * plane[:3], rms
 
 
 def _most_corners(corners: NDArray[np.float64]) -> list[int]:  # (C, 2), in order

@@ -19,7 +19,7 @@ from pcdata.errors import ConfigError, PcdataWarning
 from pcdata.functional.plane_patch import plane_patch
 from pcdata.functional.plane_segments import supporting_plane
 from pcdata.functional.planes import near_planes, ransac_plane
-from pcdata.functional.rows import cloud_of_rows, count_per_cloud, pick_rows, ptr_after_mask
+from pcdata.functional.rows import cloud_of_rows, count_per_cloud, ptr_after_mask
 from pcdata.functional.selection import over_hull
 from pcdata.functional.table_surface import table_surface
 from pcdata.geometry import rigid
@@ -255,9 +255,8 @@ class RemovePlane(RemoveTransform):
         entries: list[dict[str, Any]] = []
         for b, (start, stop) in enumerate(pairwise(bounds_of(data.ptr))):
             plane = params["planes"][b]
-            own = pick_rows({"points": data.points[start:stop]}, params["per_point"][start:stop])["points"]
             inliers = int(params["num_inliers"][b])
-            found = plane_facts(own, inliers, stop - start, plane, data, b)
+            found = plane_facts(data.points[start:stop], params["per_point"][start:stop], inliers, plane, data, b)
             found["faces"] = self._faces(data, b, plane)
             for name in ("noise", "disparity_noise"):
                 if name in params and math.isfinite(value := float(params[name][b])):

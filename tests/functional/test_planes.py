@@ -166,7 +166,7 @@ def test_points_that_are_scored_are_spread_over_rows_and_columns():
 
 def test_a_plane_of_fewer_points_than_the_scored_ones_show_is_found_still():
     points = torch.rand((60_000, 3), generator=seeded(3))
-    some, ptr = planes_module.spread_points(points, torch.tensor([0, 60_000]), 16_384)
+    some, _ = planes_module.spread_points(points, torch.tensor([0, 60_000]), 16_384)
     hypotheses = planes_through(points[draw_rows(60_000, 3, 20, seeded(0))])
     assert int((plane_distance(some, hypotheses).abs() < 1e-7).sum(1).max()) < 3
     _, inliers = ransac_plane(points, distance=1e-7, probability=0.9, num_hypotheses=20)

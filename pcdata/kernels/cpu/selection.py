@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import OPERATIONS, kernel
+from pcdata.functional.plane_patch import flat_places
 from pcdata.functional.selection import require_box
 from pcdata.kernels.cpu.native import call, room
 
@@ -48,3 +51,24 @@ def hull_rows(points: Tensor) -> Tensor:
     corners, number = room(len(points), torch.int64), room(1, torch.int64)
     call("pc_convex_hull", points.contiguous(), len(points), corners, number)
     return corners[: int(number)].clone()
+
+
+@kernel("points_in_cells", "cpu")
+def points_in_cells(points: Tensor, chosen: Tensor, axes: Tensor, low: Tensor, scale: float, cells: Tensor) -> Tensor:
+    """Number the cells of chosen points in one pass."""
+    inside = room(len(points), torch.bool)
+    height, width = cells.shape
+    arrays = points.contiguous(), chosen, len(points), axes, low, float(scale), cells.contiguous(), height, width
+    call("pc_points_in_cells", *arrays, inside)
+    return inside
+
+
+@kernel("outline_rows", "cpu")
+def outline_rows(points: Tensor, chosen: Tensor, plane: Tensor, axes: Tensor) -> tuple[Tensor, float]:
+    """Leave out what is well inside of an octagon, in the pass that sums squares; few points are left."""
+    points, rows = points.contiguous(), room(len(points), torch.int64)
+    number, squares = room(1, torch.int64), room(1, torch.float64)
+    call("pc_outline_points", points, chosen, len(points), plane.contiguous(), axes, rows, number, squares)
+    rows = rows[: int(number)]
+    corners = rows[hull_rows(flat_places(points[rows], axes))]
+    return corners, math.sqrt(float(squares) / max(1, int(chosen.count_nonzero())))

@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0xCCC781461AB2A9B
+INTERFACE_NUMBER = 0x80EB96BA83D8AB9
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -121,6 +121,10 @@ pc_near_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, flo
     distance, uint8* near
 pc_refine_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, double distance, double* up,
     double max_tilt, double flat, int64 rounds, double* planes, uint8* near
+pc_outline_points: float* points, uint8* chosen, int64 count, double* plane, double* axes, int64* rows, int64* num_rows,
+    double* squares
+pc_points_in_cells: float* points, uint8* chosen, int64 count, double* axes, double* low, double scale, uint8* cells,
+    int64 height, int64 width, uint8* inside
 pc_moments: float* points, int64* ptr, int64 num_clouds, uint8* mask, double* centers, double* sums
 pc_reach: float* points, int64 rows, double* places, int64 num_places, double least, double* reach
 pc_fit_surface: float* points, int64 count, double* reach, double* plane, double* axes, double* numbers, double* height,

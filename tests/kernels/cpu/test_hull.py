@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from pcdata.contracts.dispatch import why_unavailable
-from pcdata.functional.selection import hull_rows
+from pcdata.functional.plane_patch import outline_rows, points_in_cells
+from pcdata.functional.selection import hull_rows, plane_axes
 from pcdata.rng import seeded
 
 pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason="the compiled core is not there")
@@ -51,3 +52,34 @@ SETS = _sets()
 def test_the_hull_is_that_of_the_reference(name):
     points = SETS[name]
     assert torch.equal(hull_rows(points, backend="cpu"), hull_rows(points, backend="torch"))
+
+
+PLANE = torch.nn.functional.normalize(torch.tensor([0.2, -0.3, 0.9, 0.0], dtype=torch.float64), dim=0)
+AXES = plane_axes(PLANE).T.contiguous()
+
+
+def _lifted(name):
+    """Points about a plane through the origin, and some of them chosen; float32 holds their places."""
+    flat, generator = SETS[name].clamp(-1e15, 1e15), seeded(5)
+    points = flat @ AXES + 1e-3 * torch.randn(len(flat), 1, generator=generator, dtype=torch.float64) * PLANE[:3]
+    return points.float(), torch.rand(len(flat), generator=generator) < 0.7
+
+
+@pytest.mark.parametrize("name", SETS)
+def test_the_outline_is_that_of_the_reference(name):
+    points, chosen = _lifted(name)
+    for mask in (chosen, torch.zeros_like(chosen), torch.ones_like(chosen), torch.arange(len(chosen)) == 300):
+        ours, theirs = (outline_rows(points, mask, PLANE, AXES, backend=backend) for backend in ("cpu", "torch"))
+        assert torch.equal(ours[0], theirs[0])
+        assert ours[1] == pytest.approx(theirs[1], rel=1e-12)
+
+
+@pytest.mark.parametrize("name", ["normal", "grid", "huge", "few"])
+@pytest.mark.parametrize("scale", [0.01, 3.7, 1e20])
+def test_cells_hold_the_points_of_the_reference(name, scale):
+    points, chosen = _lifted(name)
+    cells, low = torch.rand(9, 7, generator=seeded(6)) < 0.5, torch.tensor([-0.5, -1.25], dtype=torch.float64)
+    found = [points_in_cells(points, chosen, AXES, low, scale, cells, backend=backend) for backend in ("cpu", "torch")]
+    assert torch.equal(*found)
+    assert not bool((found[0] & ~chosen).any())
+    assert not len(points_in_cells(points[:0], chosen[:0], AXES, low, scale, cells, backend="cpu"))

@@ -483,6 +483,19 @@ PC_EXPORT int32_t pc_refine_planes(const pc_context* context, const float* point
                                    const double* up, double max_tilt, double flat, int64_t rounds, double* planes,
                                    uint8_t* near);
 
+// points (count, 3), chosen (count,) of 0 and 1, a plane (4,) and its axes (2, 3) -> rows (count,), the first num_rows
+// (1) rising: chosen points among which all corners of their convex hull in the plane are; squares (1): the sum of the
+// squared distances of all chosen points from the plane.
+PC_EXPORT int32_t pc_outline_points(const pc_context* context, const float* points, const uint8_t* chosen,
+                                    int64_t count, const double* plane, const double* axes, int64_t* rows,
+                                    int64_t* num_rows, double* squares);
+
+// points (count, 3), chosen (count,) of 0 and 1, axes (2, 3) of a plane, low (2,) and cells to a unit, cells (height,
+// width) of 0 and 1, as plane_patch numbers them -> inside (count,): whether a point is chosen and in a cell that is.
+PC_EXPORT int32_t pc_points_in_cells(const pc_context* context, const float* points, const uint8_t* chosen,
+                                     int64_t count, const double* axes, const double* low, double scale,
+                                     const uint8_t* cells, int64_t height, int64_t width, uint8_t* inside);
+
 // points (N, 3), ptr (num_clouds+1,), mask (N,) of 0 and 1, centers (num_clouds, 3) -> sums (num_clouds, 11) over the
 // chosen points of each cloud, with p their offsets from its center: count, largest absolute coordinate, x, y, z, xx,
 // xy, xz, yy, yz, zz. The same bits for any number of threads and any instruction set: eight lanes each add every
