@@ -278,12 +278,12 @@ def ransac_plane(
             floors = torch.zeros(len(own_ptr) - 1, dtype=torch.int64, device="cpu")
             near = record_planes(own, own_ptr, runs, hypotheses, competes, distance, floors, backend=backend)
         else:
-            not_drawn = hypotheses.shape[1] - num_hypotheses
-            search = distance, probability, backend, not_drawn
-            near = _count_until_probable(*spread_points(own, own_ptr, _SCORED), hypotheses, competes, *search)
+            tried = num_hypotheses, backend
+            scored = spread_points(own, own_ptr, _SCORED)
+            near = _count_until_probable(*scored, hypotheses, competes, distance, probability, *tried)
             for b in (near.amax(1) < 3).nonzero().squeeze(1).tolist():
-                alone = _clouds_between(own, own_ptr, b, b + 1)
-                near[b] = _count_until_probable(*alone, hypotheses[b : b + 1], competes[b : b + 1], *search)[0]
+                alone = *_clouds_between(own, own_ptr, b, b + 1), hypotheses[b : b + 1], competes[b : b + 1]
+                near[b] = _count_until_probable(*alone, distance, probability, *tried)[0]
         winners.append(_best_planes(hypotheses, is_plane, competes, near, distance, first))
     runs = runs if at_once >= num_clouds else ()  # of all clouds
     planes, inliers = refine_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, runs, backend=backend)
@@ -318,14 +318,15 @@ def _count_until_probable(
     competes: Tensor,  # (B, P)
     distance: float,
     probability: float,
+    num_hypotheses: int,  # the last of the planes; those before them are no tries
     backend: str,
-    not_drawn: int,  # of the first planes
 ) -> Tensor:  # counts (B, P) of the planes that were the best so far; 0 of others and behind each cloud's last try
     """Score hypotheses, in blocks where few may do, until the last cloud has been tried often enough."""
     floors = torch.zeros(len(ptr) - 1, dtype=torch.int64, device="cpu")
     sizes = counts_from_ptr(ptr).cpu()[:, None].double()
     counts = torch.zeros(competes.shape, dtype=torch.int64, device="cpu")
     tries, first, block = hypotheses.shape[1], 0, _FIRST_TRIES
+    not_drawn = tries - num_hypotheses
     last = torch.full_like(sizes, tries)
     while first < tries and bool((last > first).any()):
         some = slice(first, min(first + block, tries))
