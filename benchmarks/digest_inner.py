@@ -139,6 +139,7 @@ def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     competes, floors = planes[:, :, 0] < 0.9, torch.zeros(2, dtype=torch.int64)
     yield "bound_runs", "small", lambda: ((cloud, ptr), {})
     yield "record_planes", "two", lambda: ((cloud, ptr, NO_RUNS, planes, competes, distance, floors), {})
+    yield "search_planes", "two", lambda: ((cloud, ptr, planes, competes, distance, 0.9, 0, 5), {})
     yield "near_planes", "two", lambda: ((cloud, ptr, planes[:, 0], distance), {})
     yield "fit_planes", "two", lambda: ((cloud, ptr, cloud[:, 2] > 0.05), {})
     yield "refine_planes", "two", lambda: ((cloud, ptr, planes[:, 0], distance, None, None), {})

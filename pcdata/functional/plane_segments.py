@@ -27,6 +27,7 @@ from pcdata.functional.planes import (
     ransac_plane,
     record_planes,
     refine_planes,
+    search_planes,
 )
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.voxels import voxel_downsample
@@ -48,7 +49,7 @@ _MOST_SPAN = 1e6
     probability=checked_probability,
     max_planes=checked_count,
     min_share=checked_fraction,
-    steps=(draw_planes, bound_runs, record_planes, refine_planes),
+    steps=(draw_planes, bound_runs, record_planes, search_planes, refine_planes),
     gradient=False,
 )
 def segment_planes(
@@ -132,7 +133,16 @@ def segment_planes(
     min_share=checked_fraction,
     likely_up=checked_up,
     viewpoint=checked_places,
-    steps=(draw_planes, bound_runs, record_planes, refine_planes, near_planes, nearest_rows, density_clusters),
+    steps=(
+        draw_planes,
+        bound_runs,
+        record_planes,
+        search_planes,
+        refine_planes,
+        near_planes,
+        nearest_rows,
+        density_clusters,
+    ),
     gradient=False,
 )
 def supporting_plane(

@@ -28,7 +28,7 @@ _PLANES, _POINTS = 64, 4096
 # Hypotheses of the first look where few may do; as many again as there were after each.
 _FIRST_TRIES = 64
 # Points that hypotheses are scored on where they need not be the best of all: their shares are off by 0.4 % or less.
-_SCORED = 1 << 14
+_SCORED_BITS, _ALL_BITS = 14, 62
 # Planes drawn at a time, over all clouds: 32 MB.
 _MOST_HYPOTHESES = 1 << 20
 
@@ -125,6 +125,63 @@ def record_planes(
 
 
 @inner
+def search_planes(
+    points: Tensor,
+    ptr: Tensor,
+    planes: Tensor,  # (B, P, 4)
+    competes: Tensor,  # (B, P) bool
+    distance: float,
+    probability: float,
+    not_drawn: int,  # of the first planes
+    bits: int,  # 2^bits points are looked at, of clouds that have more
+    *,
+    backend: str = "auto",
+) -> Tensor:  # counts (B, P) of the planes that were the best so far; 0 of others and behind each cloud's last try
+    """Score planes as record_planes does, in blocks where few may do, until all clouds have been tried often enough."""
+    points, ptr = spread_points(points, ptr, bits)
+    floors = torch.zeros(len(ptr) - 1, dtype=torch.int64, device="cpu")
+    sizes = counts_from_ptr(ptr).cpu()[:, None].double()
+    counts = torch.zeros(competes.shape, dtype=torch.int64, device="cpu")
+    tries, first, block = planes.shape[1], 0, _FIRST_TRIES
+    last = torch.full_like(sizes, tries)
+    while first < tries and bool((last > first).any()):
+        some = slice(first, min(first + block, tries))
+        part, asked = planes[:, some].contiguous(), competes[:, some] & (last > first)
+        counts[:, some] = record_planes(points, ptr, (), part, asked, distance, floors, backend=REFERENCE)
+        best = torch.maximum(counts[:, some].cummax(1).values, floors[:, None])
+        # log1p(-1) = -inf: one try finds a plane that holds all
+        needed = math.log1p(-probability) / torch.log1p(-(best / sizes).pow(3))
+        drawn = torch.arange(first + 1, some.stop + 1, dtype=torch.float64, device="cpu") - not_drawn
+        done = drawn >= needed
+        stop = torch.where(done.any(1, keepdim=True), first + done.int().argmax(1, keepdim=True) + 1.0, last)
+        last = torch.where(last > first, stop, last)
+        floors = best[:, -1].clone()
+        first, block = some.stop, 2 * block
+    return counts.masked_fill_(torch.arange(tries, dtype=torch.int64, device="cpu") >= last, 0)
+
+
+def spread_points(points: Tensor, ptr: Tensor, bits: int) -> tuple[Tensor, Tensor]:
+    """Return 2^bits points of each cloud that has more, and their ptr: one out of each of as many stretches.
+
+    Which one of a stretch follows no period, so rows and columns of images are met alike. Steps of the golden ratio
+    fill an interval evenly: Weyl's sequence, as in Knuth, The Art of Computer Programming, volume 3, section 6.4.
+    """
+    bounds, most = list(pairwise(ptr.tolist())), 1 << bits
+    if all(stop - start <= most for start, stop in bounds):
+        return points, ptr
+    number = torch.arange(most + 1, dtype=torch.int64, device=points.device)
+    part = number[:-1] * 2654435769 & 0xFFFFFFFF  # of 2^32
+    chosen = []
+    for start, stop in bounds:
+        if stop - start <= most:
+            chosen.append(points[start:stop])
+            continue
+        edges = start + (number * (stop - start) >> bits)
+        chosen.append(points.index_select(0, edges[:-1] + (part * edges.diff() >> 32)))
+    return torch.cat(chosen), ptr_from_counts([len(one) for one in chosen], device=ptr.device)
+
+
+@inner
 def near_planes(
     points: Tensor,
     ptr: Tensor,
@@ -205,7 +262,7 @@ def refine_planes(
     max_tilt=checked_tilt,
     probability=checked_probability,
     guess=checked_guess,
-    steps=(draw_planes, bound_runs, record_planes, refine_planes),
+    steps=(draw_planes, bound_runs, record_planes, search_planes, refine_planes),
     gradient=False,
 )
 def ransac_plane(
@@ -278,70 +335,15 @@ def ransac_plane(
             floors = torch.zeros(len(own_ptr) - 1, dtype=torch.int64, device="cpu")
             near = record_planes(own, own_ptr, runs, hypotheses, competes, distance, floors, backend=backend)
         else:
-            tried = num_hypotheses, backend
-            scored = spread_points(own, own_ptr, _SCORED)
-            near = _count_until_probable(*scored, hypotheses, competes, distance, probability, *tried)
+            search = distance, probability, hypotheses.shape[1] - num_hypotheses
+            near = search_planes(own, own_ptr, hypotheses, competes, *search, _SCORED_BITS, backend=backend)
             for b in (near.amax(1) < 3).nonzero().squeeze(1).tolist():
                 alone = *_clouds_between(own, own_ptr, b, b + 1), hypotheses[b : b + 1], competes[b : b + 1]
-                near[b] = _count_until_probable(*alone, distance, probability, *tried)[0]
+                near[b] = search_planes(*alone, *search, _ALL_BITS, backend=backend)[0]
         winners.append(_best_planes(hypotheses, is_plane, competes, near, distance, first))
     runs = runs if at_once >= num_clouds else ()  # of all clouds
     planes, inliers = refine_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, runs, backend=backend)
     return _face(planes, up, distance).to(points.device), inliers
-
-
-def spread_points(points: Tensor, ptr: Tensor, most: int) -> tuple[Tensor, Tensor]:
-    """Return ``most`` points (M, 3) of each cloud that has more, and its ptr: one out of each of as many stretches.
-
-    Which one of a stretch follows no period, so rows and columns of images are met alike. Steps of the golden ratio
-    fill an interval evenly: Weyl's sequence, as in Knuth, The Art of Computer Programming, volume 3, section 6.4.
-    """
-    bounds = list(pairwise(ptr.tolist()))
-    if all(stop - start <= most for start, stop in bounds):
-        return points, ptr
-    number = torch.arange(most, dtype=torch.int64, device=points.device)
-    part = number * 2654435769 & 0xFFFFFFFF  # of 2^32
-    chosen = []
-    for start, stop in bounds:
-        if stop - start <= most:
-            chosen.append(points[start:stop])
-            continue
-        first, after = (at * (stop - start) // most for at in (number, number + 1))
-        chosen.append(points[start + first + (part * (after - first) >> 32)])
-    return torch.cat(chosen), ptr_from_counts([len(one) for one in chosen], device=ptr.device)
-
-
-def _count_until_probable(
-    points: Tensor,
-    ptr: Tensor,
-    hypotheses: Tensor,  # (B, P, 4)
-    competes: Tensor,  # (B, P)
-    distance: float,
-    probability: float,
-    num_hypotheses: int,  # the last of the planes; those before them are no tries
-    backend: str,
-) -> Tensor:  # counts (B, P) of the planes that were the best so far; 0 of others and behind each cloud's last try
-    """Score hypotheses, in blocks where few may do, until the last cloud has been tried often enough."""
-    floors = torch.zeros(len(ptr) - 1, dtype=torch.int64, device="cpu")
-    sizes = counts_from_ptr(ptr).cpu()[:, None].double()
-    counts = torch.zeros(competes.shape, dtype=torch.int64, device="cpu")
-    tries, first, block = hypotheses.shape[1], 0, _FIRST_TRIES
-    not_drawn = tries - num_hypotheses
-    last = torch.full_like(sizes, tries)
-    while first < tries and bool((last > first).any()):
-        some = slice(first, min(first + block, tries))
-        part, asked = hypotheses[:, some].contiguous(), competes[:, some] & (last > first)
-        counts[:, some] = record_planes(points, ptr, (), part, asked, distance, floors, backend=backend)
-        best = torch.maximum(counts[:, some].cummax(1).values, floors[:, None])
-        # log1p(-1) = -inf: one try finds a plane that holds all
-        needed = math.log1p(-probability) / torch.log1p(-(best / sizes).pow(3))
-        drawn = torch.arange(first + 1, some.stop + 1, dtype=torch.float64, device="cpu") - not_drawn
-        done = drawn >= needed
-        stop = torch.where(done.any(1, keepdim=True), first + done.int().argmax(1, keepdim=True) + 1.0, last)
-        last = torch.where(last > first, stop, last)
-        floors = best[:, -1].clone()
-        first, block = some.stop, 2 * block
-    return counts.masked_fill_(torch.arange(tries, dtype=torch.int64, device="cpu") >= last, 0)
 
 
 def _draw_triples(counts: list[int], num_hypotheses: int, seeds: list[int]) -> tuple[Tensor, Tensor]:

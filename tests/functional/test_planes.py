@@ -155,7 +155,7 @@ def test_points_that_are_scored_are_spread_over_rows_and_columns():
     counts = torch.tensor([848 * 480, 5, 64 * 16_384])
     ptr = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
     rows = torch.arange(int(ptr[-1]), dtype=torch.float64)[:, None].expand(-1, 3)
-    chosen, chosen_ptr = planes_module.spread_points(rows, ptr, 16_384)
+    chosen, chosen_ptr = planes_module.spread_points(rows, ptr, 14)
     assert chosen_ptr.tolist() == [0, 16_384, 16_389, 32_773]
     assert bool((chosen[1:, 0] > chosen[:-1, 0]).all())
     for own, width in ((chosen[:16_384, 0], 848), (chosen[16_389:, 0] - float(ptr[2]), 64)):
@@ -166,7 +166,7 @@ def test_points_that_are_scored_are_spread_over_rows_and_columns():
 
 def test_a_plane_of_fewer_points_than_the_scored_ones_show_is_found_still():
     points = torch.rand((60_000, 3), generator=seeded(3))
-    some, _ = planes_module.spread_points(points, torch.tensor([0, 60_000]), 16_384)
+    some, _ = planes_module.spread_points(points, torch.tensor([0, 60_000]), 14)
     hypotheses = planes_through(points[draw_rows(60_000, 3, 20, seeded(0))])
     assert int((plane_distance(some, hypotheses).abs() < 1e-7).sum(1).max()) < 3
     _, inliers = ransac_plane(points, distance=1e-7, probability=0.9, num_hypotheses=20)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -111,6 +112,24 @@ def record_planes(
     call(
         "pc_record_planes", points, ptr, count, *known, planes.float(), competes, some, float(distance), floors, counts
     )  # fmt: skip
+    return counts
+
+
+@kernel("search_planes", "cpu")
+def search_planes(
+    points: Tensor,
+    ptr: Tensor,
+    planes: Tensor,
+    competes: Tensor,
+    distance: float,
+    probability: float,
+    not_drawn: int,
+    bits: int,
+) -> Tensor:
+    """Count some planes at a time on points that stay in the processor's cache."""
+    counts, missed = room(planes.shape[:2], torch.int64), math.log1p(-probability)
+    some = planes.float(), competes.contiguous(), planes.shape[1], float(distance), missed, not_drawn, counts
+    call("pc_search_planes", points, ptr, len(planes), bits, *some)
     return counts
 
 

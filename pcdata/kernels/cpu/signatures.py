@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x80EB96BA83D8AB9
+INTERFACE_NUMBER = 0x139E0B0B9E90E7E
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -117,6 +117,8 @@ pc_planes_of_triples: float* points, int64* ptr, int64 num_clouds, int64* triple
 pc_bound_runs: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs
 pc_record_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, float* planes, uint8*
     competes, int64 num_planes, double distance, int64* floors, int64* counts
+pc_search_planes: float* points, int64* ptr, int64 num_clouds, int64 bits, float* planes, uint8* competes, int64
+    num_planes, double distance, double missed, int64 not_drawn, int64* counts
 pc_near_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, float* planes, double
     distance, uint8* near
 pc_refine_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, double distance, double* up,

@@ -312,6 +312,23 @@ def test_runs_of_points_change_no_count(order, scale, machine):
         assert_records_equal(points, ptr, drawn, competes, distance, torch.tensor([0, 3, 0, 500, 10_000]))
 
 
+@pytest.mark.parametrize("probability", [0.2, 0.9, 1 - 1e-15])
+@pytest.mark.parametrize("not_drawn", [0, 1])
+def test_a_search_that_may_stop_equals_the_reference(probability, not_drawn, machine):
+    from pcdata.functional import planes
+
+    points = torch.cat([organized(130, 170), organized(90, 100), organized(20, 30)]).contiguous()
+    ptr = ptr_from_counts([22_100, 9_000, 0, 600])
+    drawn = planes_through(points[draw_rows(22_100, 3, 101, seeded(2))])[None].repeat(4, 1, 1)
+    drawn[:, 7] = torch.nan
+    competes = ~drawn[..., 0].isnan()
+    competes[:, ::5] = False
+    for distance, bits in ((0.004, 14), (0.02, 14), (0.02, 7), (1e-9, 10), (0.05, 62)):
+        arguments = points, ptr, drawn, competes, distance, probability, not_drawn, bits
+        expected = reference_of((probability, not_drawn, distance, bits), planes.search_planes, *arguments)
+        assert torch.equal(planes.search_planes(*arguments, backend="cpu"), expected)
+
+
 @pytest.mark.parametrize("order", ["image", "shuffled", "sorted", "line"])
 def test_refinement_equals_the_reference(order, machine):
     """Of large and small clouds, whatever their order says of the points."""

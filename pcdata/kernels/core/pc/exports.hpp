@@ -468,6 +468,14 @@ PC_EXPORT int32_t pc_record_planes(const pc_context* context, const float* point
                                    const uint8_t* competes, int64_t num_planes, double distance, const int64_t* floors,
                                    int64_t* counts);
 
+// points (N, 3), ptr (num_clouds+1,), planes (num_clouds, H, 4), competes (num_clouds, H) 0 or 1 -> counts (num_clouds,
+// H) as pc_record_planes gives them with floors of 0, on 2^bits points of each cloud that has more; 0 of all behind the
+// plane after which the search may stop: missed = log(1 - probability), and the first not_drawn are no tries.
+PC_EXPORT int32_t pc_search_planes(const pc_context* context, const float* points, const int64_t* ptr,
+                                   int64_t num_clouds, int64_t bits, const float* planes, const uint8_t* competes,
+                                   int64_t num_planes, double distance, double missed, int64_t not_drawn,
+                                   int64_t* counts);
+
 // points (N, 3), ptr (num_clouds+1,), what pc_bound_runs made or null, planes (num_clouds, 4) -> near (N,), 0 or 1:
 // whether a point is near its cloud's.
 PC_EXPORT int32_t pc_near_planes(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
