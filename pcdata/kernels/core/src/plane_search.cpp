@@ -9,7 +9,6 @@ namespace pc::planes {
 namespace {
 
 constexpr int64_t kTries = 32;  // planes counted before it is looked whether they are enough
-constexpr int kTogether = 4;    // planes per load of a point
 constexpr int64_t kBlocks = 8;  // of points, that one thread takes at a time; a small cloud has no more
 
 struct Chance {
@@ -49,11 +48,7 @@ class ScoredPoints {
     std::vector<int64_t> own(static_cast<size_t>(pieces * kTries), 0);
     parallel_for(context, num_blocks_, kBlocks, [&](int64_t begin, int64_t end, int64_t) {
       int64_t* to = own.data() + begin / kBlocks * kTries;
-      for (int64_t b = begin; b < end; ++b) {
-        int64_t h = 0;
-        for (; h + kTogether <= some; h += kTogether) count_near<kTogether>(blocks_[b], planes + h, distance, to + h);
-        for (; h < some; ++h) count_near<1>(blocks_[b], planes + h, distance, to + h);
-      }
+      for (int64_t b = begin; b < end; ++b) count_near_all(blocks_[b], planes, some, distance, to);
     });
     std::fill_n(counts, some, 0);
     for (int64_t piece = 0; piece < pieces; ++piece)

@@ -10,7 +10,6 @@
 namespace pc::planes {
 namespace {
 
-constexpr int kTogether = 4;  // planes per load of a point: four times four coefficients fit 32 registers
 // Points that one thread takes at a time: 1000 hypotheses on them take about 2 ms.
 constexpr int64_t kCountedPiece = 8 * PointBlock::kSize;
 // Points that one thread marks at a time: 30 us, as long as another thread takes to start.
@@ -47,9 +46,7 @@ void count_piece(const float* points, int64_t begin, int64_t end, const Plane* p
   PointBlock block;
   for (int64_t i = begin; i < end; i += PointBlock::kSize) {
     block.read(points, i, std::min<int64_t>(end, i + PointBlock::kSize));
-    int64_t h = 0;
-    for (; h + kTogether <= num_planes; h += kTogether) count_near<kTogether>(block, planes + h, distance, counts + h);
-    for (; h < num_planes; ++h) count_near<1>(block, planes + h, distance, counts + h);
+    count_near_all(block, planes, num_planes, distance, counts);
   }
 }
 

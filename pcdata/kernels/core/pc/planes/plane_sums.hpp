@@ -59,6 +59,14 @@ inline void count_near(const PointBlock& block, const Plane* planes, float dista
   for (int h = 0; h < kTogether; ++h) counts[h] += sum_of_lanes(near[h]);
 }
 
+// The same of any number of planes: four times four coefficients fit 32 registers.
+inline void count_near_all(const PointBlock& block, const Plane* planes, int64_t num_planes, float distance,
+                           int64_t* counts) {
+  int64_t h = 0;
+  for (; h + 4 <= num_planes; h += 4) count_near<4>(block, planes + h, distance, counts + h);
+  for (; h < num_planes; ++h) count_near<1>(block, planes + h, distance, counts + h);
+}
+
 typedef double Double8 __attribute__((vector_size(64)));
 typedef float Float8 __attribute__((vector_size(32)));
 typedef int64_t Long8 __attribute__((vector_size(64)));
