@@ -38,6 +38,8 @@ CHECKS = (
     "stated",
     "poses",
     "behind_camera",
+    "at_origin",
+    "strays",
     "repeats",
     "clock",
     "pose_direction",

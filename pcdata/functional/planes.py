@@ -149,8 +149,7 @@ def search_planes(
         part, asked = planes[:, some].contiguous(), competes[:, some] & (last > first)
         counts[:, some] = record_planes(points, ptr, (), part, asked, distance, floors, backend=REFERENCE)
         best = torch.maximum(counts[:, some].cummax(1).values, floors[:, None])
-        # log1p(-1) = -inf: one try finds a plane that holds all
-        needed = math.log1p(-probability) / torch.log1p(-(best / sizes).pow(3))
+        needed = tries_needed(best, sizes, probability)
         drawn = torch.arange(first + 1, some.stop + 1, dtype=torch.float64, device="cpu") - not_drawn
         done = drawn >= needed
         stop = torch.where(done.any(1, keepdim=True), first + done.int().argmax(1, keepdim=True) + 1.0, last)
@@ -158,6 +157,12 @@ def search_planes(
         floors = best[:, -1].clone()
         first, block = some.stop, 2 * block
     return counts.masked_fill_(torch.arange(tries, dtype=torch.int64, device="cpu") >= last, 0)
+
+
+def tries_needed(near: Tensor, sizes: Tensor, probability: float) -> Tensor:
+    """Return of how many tries one finds a plane with so many of the points near it, with the probability."""
+    # log1p(-1) = -inf: one try finds a plane that holds all
+    return math.log1p(-probability) / torch.log1p(-(near / sizes).pow(3))
 
 
 def spread_points(points: Tensor, ptr: Tensor, bits: int) -> tuple[Tensor, Tensor]:

@@ -1,8 +1,8 @@
 """The nouns: cameras, depth frames, point clouds."""
 
+from pcdata.functional.depth.confidence import Confidence
 from pcdata.structures.calibration import Calibration, Evidence
 from pcdata.structures.camera import Camera
-from pcdata.structures.confidence import Confidence
 from pcdata.structures.depth_frame import DepthFrame
 from pcdata.structures.depth_to_color import register_to_color
 from pcdata.structures.episodes import Episode

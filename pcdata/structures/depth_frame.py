@@ -17,11 +17,11 @@ from pcdata.contracts.lengths import FARTHEST, check_depth
 from pcdata.contracts.on_host import look
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import CaptureError, FrameError, ShapeError
+from pcdata.functional.depth.confidence import Confidence
 from pcdata.functional.depth.deproject import mask_depth
 from pcdata.functional.depth.stored_depth import depth_in_metres
 from pcdata.geometry import rigid
 from pcdata.structures.camera import Camera, check_view
-from pcdata.structures.confidence import Confidence
 from pcdata.structures.image_arrays import camera_of, image_tensor, pose_tensor
 from pcdata.structures.kinds import CAMERA_FRAME
 from pcdata.structures.point_arrays import signals_of_arrays

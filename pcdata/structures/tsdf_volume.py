@@ -12,10 +12,10 @@ from torch.nn.functional import pad
 
 from pcdata.errors import CaptureError, ConfigError, DeviceError, DTypeError, FrameError, VolumeTooLargeError
 from pcdata.functional import tsdf
+from pcdata.functional.depth.confidence import Confidence
 from pcdata.functional.depth.deproject import check_rays, pixel_rays
 from pcdata.functional.tsdf.views import UNIT_WEIGHT
 from pcdata.geometry.lens_models import WIDEST_PLAIN
-from pcdata.structures.confidence import Confidence
 from pcdata.structures.depth_frame import DepthFrame
 from pcdata.structures.kinds import Kind
 from pcdata.structures.point_cloud import PointCloud

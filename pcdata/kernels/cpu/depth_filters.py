@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-import pcdata.structures.filled_depth  # noqa: F401 - the functions must be registered before their kernels
+import pcdata.functional.depth.confidence  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.depth.disparity import smallest_edge
 from pcdata.functional.depth.holes import RULES

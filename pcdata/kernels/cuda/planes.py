@@ -9,8 +9,8 @@ from torch import Tensor
 
 import pcdata.functional.planes  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, kernel
-from pcdata.functional.planes import MAX_REFINEMENTS, within_tilt
-from pcdata.functional.rows import cloud_of_rows
+from pcdata.functional.planes import MAX_REFINEMENTS, spread_points, tries_needed, within_tilt
+from pcdata.functional.rows import cloud_of_rows, counts_from_ptr
 from pcdata.geometry.plane_fit import plane_of_moments
 from pcdata.kernels.cuda.launching import BLOCK, Launcher, launcher_of
 
@@ -54,6 +54,27 @@ def record_planes(
     counts = found.cpu().long()
     before = torch.cat([floors[:, None], counts[:, :-1]], 1).cummax(1).values
     return counts.masked_fill_((counts <= before) | (counts <= floors[:, None]), 0)
+
+
+@kernel("search_planes", "cuda")
+def search_planes(
+    points: Tensor,
+    ptr: Tensor,
+    planes: Tensor,
+    competes: Tensor,
+    distance: float,
+    probability: float,
+    not_drawn: int,
+    bits: int,
+) -> Tensor:
+    """Count for all planes at once, which costs less than a second wait, and forget those behind the last try."""
+    points, ptr = spread_points(points, ptr, bits)
+    floors = torch.zeros(len(planes), dtype=torch.int64, device="cpu")
+    counts = record_planes(points, ptr, (), planes, competes, distance, floors)
+    sizes = counts_from_ptr(ptr).cpu()[:, None].double()
+    drawn = torch.arange(1, planes.shape[1] + 1, dtype=torch.float64, device="cpu") - not_drawn
+    is_enough = drawn >= tries_needed(counts.cummax(1).values, sizes, probability)
+    return counts.masked_fill_(is_enough.cumsum(1) - is_enough.int() > 0, 0)
 
 
 @kernel("refine_planes", "cuda")
