@@ -120,9 +120,18 @@ def hull_corners(points: Tensor, surface: Tensor, plane: Tensor) -> tuple[Tensor
 
 def _most_corners(corners: NDArray[np.float64]) -> list[int]:  # (C, 2), in order
     """Say which corners stay: again and again the one goes whose triangle with its neighbors is smallest."""
-    kept = np.arange(len(corners))
+    kept = list(range(len(corners)))
+    places = corners.tolist()
+    sizes = [_corner_size(places, kept, at) for at in kept] if len(kept) > _MOST_CORNERS else []
     while len(kept) > _MOST_CORNERS:
-        here = corners[kept]
-        before, after = np.roll(here, 1, 0) - here, np.roll(here, -1, 0) - here
-        kept = np.delete(kept, np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]).argmin())
-    return [int(one) for one in kept]
+        gone = sizes.index(min(sizes))
+        del kept[gone], sizes[gone]
+        for at in (gone - 1, gone % len(kept)):
+            sizes[at] = _corner_size(places, kept, at)
+    return kept
+
+
+def _corner_size(places: list[list[float]], kept: list[int], at: int) -> float:
+    """Return twice the area of the triangle of a corner and its neighbors."""
+    (left_x, left_y), (x, y), (right_x, right_y) = (places[kept[(at + step) % len(kept)]] for step in (-1, 0, 1))
+    return abs((left_x - x) * (right_y - y) - (left_y - y) * (right_x - x))
