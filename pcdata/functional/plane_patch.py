@@ -14,8 +14,9 @@ _REACH = 5  # distances from the plane that tell whether something crosses it
 _MOST_CELLS = 500  # along a side: a stray far away needs no more
 _CELL = 4  # distances: the least edge of a cell
 _MOST_LONELY = 0.2  # of the cells may hold one point alone: those of the rim do; more, and cells are too small
-_CROSSED = 0.5  # a wall that crosses the slab of a plane has a fifth of its points near it within that reach
-_LEAST_PATCH = 0.1  # of the largest: parts of a table behind what stands on it, and no strays at its height
+_CROSSED = 2  # times: a wall that crosses the slab of a plane has a fifth of its points near it within that reach
+_SHARE_BITS = 30
+_SMALLER = 10  # times: parts of a table behind what stands on it, and no strays at its height
 
 
 def plane_patch(
@@ -31,34 +32,50 @@ def plane_patch(
     they are on average are left out; of the others, the connected patches that are a tenth as large as the largest
     are kept. Cells have an edge of 4 distances, doubled until a fifth at most holds one point alone.
     """
-    points, plane = points.detach(), plane.detach()
+    points, plane = points.detach(), plane.detach().double().cpu()
+    axes = plane_axes(plane).T.contiguous()
+    low, scale, cells = patch_cells(points, near, plane, axes, distance)
+    return points_in_cells(points, near, axes, low, scale, cells) if len(cells) else near
+
+
+@inner
+def patch_cells(
+    points: Tensor,  # (n, 3) float32
+    near: Tensor,  # (n,) bool
+    plane: Tensor,  # (4,) float64 on the CPU
+    axes: Tensor,  # (2, 3) float64 on the CPU: of the plane
+    distance: float,
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, float, Tensor]:  # low (2,) float64 on the CPU, cells to a unit, (rows, columns) bool
+    """Mark the cells of the surface, and say where cells begin; none at all where no point looked at is near."""
     stride = max(1, len(points) // _MOST_POINTS)
-    normal, offset = plane[:3].to(points.dtype), float(plane[3])
-    own, height = near[::stride], points[::stride] @ normal + offset
-    around = (own | (height.abs() < _REACH * distance)).nonzero().squeeze(1)
+    own, some = near[::stride], points[::stride]
+    x, y, z = some.unbind(1)
+    a, b, c, d = plane.tolist()
+    around = (own | ((((x * a + y * b) + z * c) + d).abs() < _REACH * distance)).nonzero().squeeze(1)
     own = own[around]
     if not bool(own.any()):
-        return near
-    axes = plane_axes(plane).T.cpu().contiguous()
-    flat = _flat(points[::stride][around], axes)
-    low, high = flat.amin(1), flat.amax(1)
-    span = float((high - low).max())
+        return torch.zeros(2, dtype=torch.float64, device="cpu"), 0.0, own.new_zeros(0, 0)
+    flat = _flat(some[around], axes)
+    low = flat.amin(1)
+    spans = (flat.amax(1) - low).tolist()
+    span = max(spans)
     edge = max(_CELL * distance, span / _MOST_CELLS)
     while True:
-        size = [int(cells) + 5 for cells in ((high - low) / edge).tolist()]
+        size = [int(along / edge) + 5 for along in spans]
         cell = _cells(flat, low, 1 / edge, size)
         count = torch.bincount(cell[own], minlength=size[0] * size[1])
         if int((count == 1).sum()) <= _MOST_LONELY * int((count > 0).sum()) or edge > span / 4:
             break
         edge *= 2
-    share = count / torch.bincount(cell, minlength=len(count)).clamp(min=1)
-    usual = float((count * share).sum() / count.sum())
-    kept = _large_patches(((count > 0) & (share >= _CROSSED * usual)).reshape(size))
+    # Shares in whole numbers: their sum is the same in any order.
+    share = (count << _SHARE_BITS) // torch.bincount(cell, minlength=len(count)).clamp_(min=1)
+    usual = share * (_CROSSED * count.sum()) >= (count * share).sum()
+    kept = _large_patches(((count > 0) & usual).reshape(size))
     # Cells at its rim without any point of those that were looked at.
     kept |= _grown(kept) & (count == 0).reshape(size)
-    if stride == 1 and bool(kept.reshape(-1)[cell[own]].all()):
-        return near
-    return points_in_cells(points, near, axes, low.double().cpu(), 1 / edge, kept)
+    return low.double().cpu(), 1 / edge, kept
 
 
 @inner
@@ -138,5 +155,5 @@ def _large_patches(cells: Tensor) -> Tensor:
     patch = lowest_rows(torch.cat(pairs, 1), len(rows), cells.device)
     area = torch.bincount(patch, minlength=len(rows))
     large = torch.zeros_like(cells)
-    large[v, u] = area[patch] >= _LEAST_PATCH * area.max()
+    large[v, u] = area[patch] * _SMALLER >= area.max()
     return large

@@ -14,6 +14,7 @@ from pcdata.kernels.cpu.native import call, room
 
 # The core numbers the rows of one cloud with 31 bits.
 _MAX_ROWS = 2**31 - 1
+_MOST_CELLS = 512 * 512  # of a plane
 
 
 @kernel("box_mask", "cpu")
@@ -51,6 +52,21 @@ def hull_rows(points: Tensor) -> Tensor:
     corners, number = room(len(points), torch.int64), room(1, torch.int64)
     call("pc_convex_hull", points.contiguous(), len(points), corners, number)
     return corners[: int(number)].clone()
+
+
+@kernel("patch_cells", "cpu")
+def patch_cells(
+    points: Tensor, near: Tensor, plane: Tensor, axes: Tensor, distance: float
+) -> tuple[Tensor, float, Tensor]:
+    """Count points in cells, and join these, in one call."""
+    size, numbers, cells = room(2, torch.int64), room(3, torch.float64), room(_MOST_CELLS, torch.bool)
+    given = points.contiguous(), near.contiguous(), len(points), plane.contiguous(), axes, float(distance)
+    call("pc_patch_cells", *given, size, numbers, cells)
+    height, width = size.tolist()
+    if height < 0:  # the reference says so
+        found: tuple[Tensor, float, Tensor] = OPERATIONS["patch_cells"].reference(points, near, plane, axes, distance)
+        return found
+    return numbers[:2], float(numbers[2]), cells[: height * width].reshape(height, width)
 
 
 @kernel("points_in_cells", "cpu")

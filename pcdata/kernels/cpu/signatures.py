@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x139E0B0B9E90E7E
+INTERFACE_NUMBER = 0x13E575FE2025A08
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -125,6 +125,8 @@ pc_refine_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, f
     double max_tilt, double flat, int64 rounds, double* planes, uint8* near
 pc_outline_points: float* points, uint8* chosen, int64 count, double* plane, double* axes, int64* rows, int64* num_rows,
     double* squares
+pc_patch_cells: float* points, uint8* near, int64 count, double* plane, double* axes, double distance, int64* size,
+    double* numbers, uint8* cells
 pc_points_in_cells: float* points, uint8* chosen, int64 count, double* axes, double* low, double scale, uint8* cells,
     int64 height, int64 width, uint8* inside
 pc_moments: float* points, int64* ptr, int64 num_clouds, uint8* mask, double* centers, double* sums

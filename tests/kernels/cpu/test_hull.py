@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pcdata.contracts.dispatch import why_unavailable
-from pcdata.functional.plane_patch import outline_rows, points_in_cells
+from pcdata.functional.plane_patch import outline_rows, patch_cells, points_in_cells
 from pcdata.functional.selection import hull_rows, plane_axes
 from pcdata.rng import seeded
 
@@ -83,3 +83,36 @@ def test_cells_hold_the_points_of_the_reference(name, scale):
     assert torch.equal(*found)
     assert not bool((found[0] & ~chosen).any())
     assert not len(points_in_cells(points[:0], chosen[:0], AXES, low, scale, cells, backend="cpu"))
+
+
+@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("distance", [1e-3, 0.05, 30.0])
+def test_the_cells_of_a_surface_are_those_of_the_reference(name, distance):
+    points, _ = _lifted(name)
+    points = torch.cat([points, points[:, [0, 2, 1]], points.flip(0) * 0.5 + 0.01]).repeat(3, 1)  # 45,000, and walls
+    for some, offset in ((points, 0.0), (points[:700], 0.01), (points[:0], 0.0)):
+        near = (some.double() @ PLANE[:3] + offset).abs() < distance
+        plane = torch.cat([PLANE[:3], torch.tensor([offset], dtype=torch.float64)])
+        for mask in (near, torch.zeros_like(near)):
+            ours, theirs = (
+                patch_cells(some, mask, plane, AXES, distance, backend=backend) for backend in ("cpu", "torch")
+            )
+            assert torch.equal(ours[0], theirs[0])
+            assert ours[1] == theirs[1]
+            assert torch.equal(ours[2], theirs[2])
+            assert bool(ours[2].any()) == bool(mask[:: max(1, len(mask) // 16384)].any())
+
+
+def test_a_small_patch_and_a_wall_are_no_surface():
+    generator = seeded(8)
+    table = torch.rand(9000, 3, generator=generator) * torch.tensor([1.0, 1.0, 0.0])
+    stray = torch.rand(60, 3, generator=generator) * torch.tensor([0.1, 0.1, 0.0]) + torch.tensor([1.5, 0.5, 0.0])
+    wall = torch.rand(6000, 3, generator=generator) * torch.tensor([0.02, 1.0, 0.8]) + torch.tensor([1.1, 0.0, -0.4])
+    points = torch.cat([table, stray, wall])
+    plane = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=torch.float64)
+    near, axes = points[:, 2].abs() < 0.01, plane_axes(plane).T.contiguous()
+    for backend in ("cpu", "torch"):
+        low, scale, cells = patch_cells(points, near, plane, axes, 0.01, backend=backend)
+        found = points_in_cells(points, near, axes, low, scale, cells, backend=backend)
+        assert bool(found[:9000].all())
+        assert not bool(found[9000:].any())

@@ -498,6 +498,14 @@ PC_EXPORT int32_t pc_outline_points(const pc_context* context, const float* poin
                                     int64_t count, const double* plane, const double* axes, int64_t* rows,
                                     int64_t* num_rows, double* squares);
 
+// points (count, 3), near (count,) of 0 and 1, a plane (4,) and its axes (2, 3) -> size (2,): the rows and columns of
+// cells (at most 512, 512), of 0 and 1, which patch_cells marks; numbers (3,): where they begin and how many there are
+// to a unit. No rows, and zeros, where nothing that is looked at is near; -1 rows where places are too far away to be
+// numbered.
+PC_EXPORT int32_t pc_patch_cells(const pc_context* context, const float* points, const uint8_t* near, int64_t count,
+                                 const double* plane, const double* axes, double distance, int64_t* size,
+                                 double* numbers, uint8_t* cells);
+
 // points (count, 3), chosen (count,) of 0 and 1, axes (2, 3) of a plane, low (2,) and cells to a unit, cells (height,
 // width) of 0 and 1, as plane_patch numbers them -> inside (count,): whether a point is chosen and in a cell that is.
 PC_EXPORT int32_t pc_points_in_cells(const pc_context* context, const float* points, const uint8_t* chosen,
