@@ -150,7 +150,7 @@ class LivePipeline:
             confidence: beside an array: uint8, values of Confidence.
             pose: beside an array: world_from_camera, if the first frame has it.
         """
-        with self._turn:
+        with self._turn, torch_on_one_thread():  # a thread of torch's own would wait for more, at the core's expense
             started = time.perf_counter()
             number, self._number = self._number, self._number + 1
             cloud, fault, reason = None, *self._stamps.check(stamp)
@@ -195,8 +195,7 @@ class LivePipeline:
         try:
             if self.before is not None:
                 since = time.perf_counter()
-                with torch_on_one_thread():
-                    frame = self.before(frame, stamp)
+                frame = self.before(frame, stamp)
                 self._count(type(self.before).__name__, time.perf_counter() - since)
             cloud = self._run(frame)
         except NonFiniteError as error:
@@ -230,7 +229,7 @@ class LivePipeline:
             self._count(" + ".join(self._names[position] for position in steps), now - since)
             since = now
 
-        with torch_on_one_thread(), torch.no_grad(), guessing_planes(self._planes):
+        with torch.no_grad(), guessing_planes(self._planes):
             cloud: PointCloud = self.chain.run_in_passes(frame, generator=generator, after=after)
         if self._warm_planes:
             self._planes = cloud.meta[0].get("planes", ())
