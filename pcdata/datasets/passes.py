@@ -26,33 +26,35 @@ class PassWatch:
 
     def __init__(self, size: int) -> None:
         self._seen = shared(torch.zeros(size, dtype=torch.bool, device="cpu"))
-        self._again = shared(torch.zeros((), dtype=torch.int64, device="cpu"))  # reads again; negative: look no more
+        self._again = shared(torch.zeros(size, dtype=torch.bool, device="cpu"))
+        self._found = shared(torch.zeros((), dtype=torch.int64, device="cpu"))
 
     def restart(self) -> None:
         """Begin an epoch."""
-        self._seen.zero_()
-        self._again.zero_()
+        for tensor in (self._seen, self._again, self._found):
+            tensor.zero_()
 
     @property
     def has_warned(self) -> bool:
         """Whether a second pass was noticed in this epoch."""
-        return int(self._again) == _WARNED
+        return int(self._found) == _WARNED
 
     def note(self, index: int, what: str) -> None:
         """Note that a sample is read with random draws; warn once an epoch when half of a second pass is done."""
-        if int(self._again) < 0:
+        if int(self._found) != _NOTHING:
             return
-        if not bool(self._seen[index]):
-            self._seen[index] = True
+        seen, again = self._seen.numpy(), self._again.numpy()
+        if not seen[index]:
+            seen[index] = True
             return
-        size = len(self._seen)
-        if int(self._again) == 0 and int(self._seen.sum()) < (size if size < _FEW else _MOST * size):
-            self._again.fill_(_NO_PASSES)
+        size = len(seen)
+        if not again.any() and np.count_nonzero(seen) < (size if size < _FEW else _MOST * size):
+            self._found.fill_(_NO_PASSES)
             return
-        self._again += 1  # a count that workers take from each other now and then only comes a little later
-        if int(self._again) < max(2, (size + 1) // 2):
+        again[index] = True
+        if np.count_nonzero(again) < max(2, (size + 1) // 2):
             return
-        self._again.fill_(_WARNED)
+        self._found.fill_(_WARNED)
         warnings.warn(
             f"{what}: a second pass in one epoch repeats every random draw of the first; call set_epoch(number) on the "
             "dataset before each pass (with the same number where the same draws are wanted), or give Lightning and "
@@ -64,7 +66,7 @@ class PassWatch:
 
     def note_all(self, indices: NDArray[np.int64], what: str) -> None:
         """Note that several samples are read, as :meth:`note` does one after another."""
-        if int(self._again) < 0:
+        if int(self._found) != _NOTHING:
             return
         seen = self._seen.numpy()
         if len(np.unique(indices)) == len(indices) and not seen[indices].any():
@@ -89,7 +91,7 @@ class PassWatch:
 _FEW = 16
 # A loader that drops its last batch leaves a part of a pass out.
 _MOST = 0.75
-_NO_PASSES, _WARNED = -1, -2
+_NOTHING, _NO_PASSES, _WARNED = range(3)
 
 
 def shared(tensor: Tensor) -> Tensor:

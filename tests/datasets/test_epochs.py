@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import copy
 import pickle
+import sys
 import warnings
+from concurrent.futures import ThreadPoolExecutor
 
 import pytest
 import torch
@@ -12,6 +14,7 @@ from torch.utils.data import ConcatDataset, DataLoader, DistributedSampler, Rand
 
 from pcdata import CloudDataset, CountedSampler, PointCloud, collate_packed, set_epoch
 from pcdata.datasets import RepeatedEpochWarning
+from pcdata.datasets.passes import PassWatch
 from pcdata.errors import ConfigError, DTypeError
 from pcdata.transforms import Center, RandomJitter, Transform
 from tests.loaders import packed_loader
@@ -304,3 +307,19 @@ def test_a_loader_whose_method_calls_the_function_is_not_called_for_ever():
     dataset = dataset_of(4)
     Own(dataset).set_epoch(3)
     assert dataset.epoch == 3
+
+
+@pytest.mark.filterwarnings("ignore::pcdata.datasets.RepeatedEpochWarning")
+def test_workers_that_write_at_once_take_nothing_from_each_other():
+    watch = PassWatch(64)
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        for _ in range(40):
+            watch.restart()
+            for _ in range(2):
+                with ThreadPoolExecutor(4) as workers:
+                    list(workers.map(watch.note, range(64), ["dataset"] * 64))
+            assert watch.has_warned
+    finally:
+        sys.setswitchinterval(interval)
