@@ -320,7 +320,7 @@ def by_open3d(frame: pcdata.DepthFrame) -> Iterator[Step]:
     cloud = cloud.farthest_point_down_sample(1024)
     yield "farthest points", cloud
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(radius=0.02, max_nn=30))
-    cloud.orient_normals_toward_camera_location(np.zeros(3))
+    cloud.orient_normals_towards_camera_location(np.zeros(3))
     yield "normals", cloud
 
 
