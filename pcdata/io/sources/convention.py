@@ -139,12 +139,15 @@ class ConventionSource(CombinedSource):
         facts: dict[str, Any] = {
             name: getattr(self, name) for name in _SAID if self.depth in BUFFERS or name not in ("near", "far")
         }
+        read = dict(frame.provenance)
+        if self.depth in BUFFERS:  # what was read were shares of the way from near to far, not lengths
+            read = {name: value for name, value in read.items() if name not in _OF_LENGTHS}
         return replace(
             frame,
             depth=depth,
             camera=camera,
             world_from_camera=pose,
-            provenance={**frame.provenance, "convention": facts},
+            provenance={**read, "convention": facts},
             colors=upright.get("colors"),
             labels=upright.get("labels"),
             confidence=upright.get("confidence"),
@@ -154,3 +157,4 @@ class ConventionSource(CombinedSource):
 
 _SAID = ("axes", "poses", "depth", "near", "far", "rows", "principal_point")
 _IMAGES = ("depth", "colors", "labels", "confidence", "mask")
+_OF_LENGTHS = ("metres_per_unit", "depth_encoding", "unit_is_recorded")

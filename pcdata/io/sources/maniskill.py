@@ -171,6 +171,7 @@ class _ManiSkillSource(DemonstrationSource):
                 **self.provenance(sample_id),
                 "trajectory": steps.demonstration.group,
                 "metres_per_unit": _MILLIMETRE if unit else 1.0,
+                "unit_is_recorded": True,
             },
             background_label=self._label,
             images=images,

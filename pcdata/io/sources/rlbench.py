@@ -137,7 +137,12 @@ def _views(path: Path, camera: str, said: Mapping[str, Any]) -> dict[str, Stored
             camera=pinhole_of_matrix(f"{where}_intrinsics", matrix),
             pose=_pose(f"{where}_extrinsics: step {int(step)}", poses[int(step)]) @ turn,
             readers={"labels": partial(_ids, file=found["labels"][step])} if "labels" in found else {},
-            facts={"depth_encoding": "rgb24_near_far", "near_far": [near, far]},
+            facts={
+                "depth_encoding": "rgb24_near_far",
+                "near_far": [near, far],
+                "metres_per_unit": 1.0,
+                "unit_is_recorded": True,
+            },
         )
         for step in found["depth"]
     }

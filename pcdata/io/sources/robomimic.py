@@ -212,7 +212,7 @@ class _RobomimicSource(DemonstrationSource):
             assert near is not None
             assert far is not None
             depth = z_of_rendered(where, torch.from_numpy(stored), "z_buffer", near, far)
-            facts["near_far"] = [near, far]
+            facts |= {"near_far": [near, far], "metres_per_unit": 1.0, "unit_is_recorded": True}
         else:
             metres = depth_in_metres(where, stored, None)
             if far is not None:

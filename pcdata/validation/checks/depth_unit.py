@@ -9,7 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pcdata.functional.depth.unit_fit import DepthEncoding, DepthUnit, UnitFit, encoded, unit_fits, units_in_words
+from pcdata.functional.depth.unit_fit import (
+    DEPTH_ENCODINGS,
+    DepthEncoding,
+    DepthUnit,
+    UnitFit,
+    encoded,
+    unit_fits,
+    units_in_words,
+)
 from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.verdicts import Finding, Verdict
 
@@ -91,7 +99,7 @@ def stored_numbers(depth: Tensor, facts: Mapping[str, Any]) -> tuple[NDArray[Any
     """
     metres = depth.detach().cpu().numpy().astype(np.float64)
     stated = facts.get("metres_per_unit")
-    encoding: DepthEncoding = facts.get("depth_encoding", "plain")
+    encoding: DepthEncoding = next((one for one in DEPTH_ENCODINGS if one == facts.get("depth_encoding")), "plain")
     if isinstance(stated, (int, float)) and stated > 0:
         if (whole := _whole(metres, float(stated))) is not None:
             return encoded(whole, encoding), DepthUnit(float(stated), encoding), True

@@ -142,6 +142,7 @@ def test_rlbench_depth_lies_between_the_planes_and_its_camera_is_turned_upright(
     source = open_source(made.rlbench(tmp_path))
     frame = source.load("20")
     assert frame.provenance["cameras"] == ["front", "wrist"]
+    assert (frame.provenance["metres_per_unit"], frame.provenance["unit_is_recorded"]) == (1.0, True)
     expected = metres(20)
     expected[0, 0] = 0  # nothing was hit
     assert torch.allclose(frame.depth[0], expected, atol=(FAR - NEAR) / 2**24)

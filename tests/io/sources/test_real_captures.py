@@ -22,6 +22,8 @@ from scipy.spatial import cKDTree
 
 from pcdata import Deproject, ToFrame, open_source, read_pcd
 from pcdata.errors import CaptureError, IntrinsicsError, UnitError
+from pcdata.validation import validate_frame
+from pcdata.verdicts import Verdict
 
 NYU = "open3d_rgbd/other_formats/NYU_depth.pgm"
 SUN3D = "open3d_rgbd/other_formats/SUN_depth.png"
@@ -373,6 +375,12 @@ def test_a_near_plane_behind_the_far_one_is_refused(test_data: Path, tmp_path: P
     (folder / "meta_data.json").write_text(json.dumps(said))
     with pytest.raises(CaptureError, match="0 < near < far"):
         open_source(folder).load("0")
+
+
+def test_a_simulator_that_states_its_planes_leaves_no_doubt_about_the_unit(test_data: Path) -> None:
+    frame = open_source(test_data / "rlbench_five_cameras").load("80")
+    found = [one.verdict for one in validate_frame(frame) if one.name == "depth_unit"]
+    assert found == [Verdict.PASS] * 5
 
 
 def test_five_simulated_cameras_meet_on_the_table(test_data: Path) -> None:
