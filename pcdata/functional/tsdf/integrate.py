@@ -37,7 +37,8 @@ def touched_blocks(view: FusionView, grid: VoxelGrid, *, backend: str = "auto") 
     for offset in band(grid):
         z = depth + offset
         place = torch.stack([(a * z + start).floor() for a, start in zip(along, fraction, strict=True)], dim=-1)
-        found.append(pack_keys(place[z > 0].long() + camera).unique())
+        place = place[z > 0].nan_to_num(nan=_FURTHEST).clamp(-_FURTHEST, _FURTHEST)  # as whole numbers they would wrap
+        found.append(pack_keys(place.long() + camera).unique())
     return torch.cat(found).unique()
 
 

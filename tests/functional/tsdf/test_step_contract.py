@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import BACKEND_MODULES, OPERATIONS, why_unavailable
 from pcdata.contracts.fields import Fields
-from pcdata.errors import BackendError, DeviceError, DTypeError, PcdataError, ShapeError
+from pcdata.errors import BackendError, DeviceError, DTypeError, PcdataError, ShapeError, UnitError
 from pcdata.functional import tsdf
 from pcdata.functional.depth.deproject import pixel_rays
 from pcdata.rng import seeded
@@ -163,3 +163,12 @@ def test_wrong_arguments_are_refused_by_name_before_any_backend(name):
 def test_an_unknown_backend_is_refused(name):
     with pytest.raises(BackendError, match=rf"^{name}: unknown backend 'toch'; known: 'auto', 'torch'"):
         call(name, EXAMPLES[name](), "toch")
+
+
+@pytest.mark.parametrize("backend", ["torch", "auto"])
+@pytest.mark.parametrize("reading", [1e6, 1e12, 1e30, float("inf")])
+def test_a_reading_beyond_all_blocks_is_refused_and_never_wraps(reading, backend):
+    far = view(0)
+    far.depth[3, 5] = reading
+    with pytest.raises(UnitError, match=r"more than 2\^20"):
+        tsdf.touched_blocks(far, GRID, backend=backend)

@@ -1,29 +1,10 @@
 // Averaging depth images into a truncated signed distance field.
+#include "pc/math/fusion.hpp"
 #include "pc/threads.hpp"
 #include "pc/tsdf/pixels.hpp"
 
 namespace pc::tsdf {
 namespace {
-
-// OpenCV's lens model, in the order of operations of the reference.
-inline void bend(const float* c, FloatRegister& x, FloatRegister& y, const FloatRegister& r2) {
-  const FloatRegister radial =
-      (1 + r2 * (c[0] + r2 * (c[1] + r2 * c[4]))) / (1 + r2 * (c[5] + r2 * (c[6] + r2 * c[7])));
-  const FloatRegister xy = (2 * x) * y;
-  const FloatRegister bent = ((x * radial + c[2] * xy) + c[3] * (r2 + (2 * x) * x)) + (c[8] + c[9] * r2) * r2;
-  y = ((y * radial + c[2] * (r2 + (2 * y) * y)) + c[3] * xy) + (c[10] + c[11] * r2) * r2;
-  x = bent;
-}
-
-// The stored color with a pixel's averaged in, rounded up or down in turn; `share` in steps of 2^-15, `turn` likewise.
-inline Int32Register mixed_color(const Int32Register& old, const Int32Register& pixel, const Int32Register& share,
-                                 const Int32Register& turn) {
-  const auto step = [&](int shift) {
-    const Int32Register apart = ((pixel >> shift) & 1023) - ((old >> shift) & 1023);
-    return ((apart * share + turn) >> 15) << shift;
-  };
-  return ((old + step(0)) + step(10)) + step(20);
-}
 
 inline void vote(int32_t* label, int16_t* votes, const Int32Register& seen, RegisterMask near) {
   const Int32Register candidate = load<Int32Register>(label), lead = widened(votes);
@@ -76,7 +57,7 @@ void measure(const FusedView& view, const VoxelPlanes& planes, PendingBlock& tur
       const float fx = view.pinhole[0], skew = view.pinhole[1], cx = view.pinhole[2], fy = view.pinhole[3];
       const FloatRegister radius = u * u + v * v;
       counts = less(radius, zero + view.lens[12]);
-      bend(view.lens, u, v, radius);
+      math::bend_normalized(view.lens, u, v, radius);
       u = ((u * fx + v * skew) + cx) + 0.5f;
       v = (v * fy + view.pinhole[4]) + 0.5f;
     }
@@ -139,8 +120,9 @@ void update(const FusedView& view, const VoxelPlanes& planes, const PendingBlock
     const Int32Register count = counts != nullptr ? widened(counts + at) : old_weight;
     if (has_color) {
       const Int32Register color = load<Int32Register>(colors + at);
-      const Int32Register turn_up = ((count * 159 + (lane + at) * 83) & 255) << 7;
-      const Int32Register mixed = mixed_color(color, pixel_colors.at(place), rounded(share * 32768), turn_up);
+      const Int32Register turn_up = math::color_turn<Int32Register>(count, lane + at);
+      const Int32Register mixed =
+          math::mixed_color<Int32Register>(color, pixel_colors.at(place), rounded(share * 32768), turn_up);
       store(colors + at, select(near, mixed, color));
     }
     if constexpr (kMore) {

@@ -2,6 +2,7 @@
 // normals up to the last bit of a square root.
 #include <memory>
 
+#include "pc/math/fusion.hpp"
 #include "pc/threads.hpp"
 #include "pc/tsdf/field.hpp"
 
@@ -114,7 +115,7 @@ struct Crossings {
 
   void locate(double voxel_size) {
     for (int i = 0; i < count; ++i) {
-      fraction[i] = before[i] / (before[i] - after[i]);
+      fraction[i] = math::crossing_fraction(before[i], after[i]);
       const double along = static_cast<double>(corner[i]) + static_cast<double>(fraction[i]);
       place[i] = static_cast<float>(along * voxel_size);
     }
@@ -128,10 +129,8 @@ struct Crossings {
         const int32_t rise0 = rise_in(first[a][i]), rise1 = rise_in(second[a][i]);
         const auto steps0 = static_cast<float>((first[a][i] - rise0) >> 24);
         const auto steps1 = static_cast<float>((second[a][i] - rise1) >> 24);
-        const float rise = static_cast<float>(rise0) + static_cast<float>(rise1 - rise0) * fraction[i];
-        const float steps = steps0 + (steps1 - steps0) * fraction[i];
-        gradient[a][i] = rise / (2 * steps);  // not a number without a pair
-        unseen |= static_cast<int32_t>(!(steps > 0));
+        gradient[a][i] = math::slope_between(rise0, rise1, steps0, steps1, fraction[i]);
+        unseen |= static_cast<int32_t>(gradient[a][i] != gradient[a][i]);
       }
       if (unseen != 0)
         for (int i = 0; i < count; ++i)
@@ -167,9 +166,7 @@ struct Crossings {
     }
     for (int c = 0; c < 3; ++c)
       for (int i = 0; i < count; ++i) {
-        const auto from = static_cast<float>((packed[0][i] >> 10 * c) & 1023);
-        const auto to = static_cast<float>((packed[1][i] >> 10 * c) & 1023);
-        channel[c][i] = (from + (to - from) * fraction[i]) * static_cast<float>(1.0 / 1020);
+        channel[c][i] = math::channel_between(packed[0][i], packed[1][i], c, fraction[i]);
       }
   }
 
