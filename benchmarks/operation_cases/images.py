@@ -13,7 +13,7 @@ from timing import Case, installed
 import pcdata
 from pcdata import functional as F
 from pcdata.geometry.lens_models import lens_row
-from pcdata.kernels.cpu import images
+from pcdata.kernels import cameras
 from pcdata.structures import Camera
 from pcdata.structures.rendering import render
 from pcdata.structures.surface_mesh import SurfaceMesh
@@ -185,7 +185,7 @@ def one_lens(name: str, lens: torch.Tensor, depth: torch.Tensor, color: torch.Te
         return np.concatenate([rays * z, z], 1)
 
     def new_lens() -> torch.Tensor:
-        images._cached_rays.cache_clear()
+        cameras.cached_rays.cache_clear()
         return F.deproject_depth(depth, K, distortion=lens)[0]
 
     def apart(ours: torch.Tensor, theirs: np.ndarray) -> str:

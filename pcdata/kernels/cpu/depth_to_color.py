@@ -8,7 +8,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import OPERATIONS, kernel
 from pcdata.functional.depth.depth_to_color import RegisteredDepth, check_cameras, half_pixels
 from pcdata.geometry.lens import plain_lenses
-from pcdata.kernels.cpu.images import rays_of_cameras
+from pcdata.kernels.cameras import rays_of_cameras
 from pcdata.kernels.cpu.native import call, room, room_for
 
 # The core numbers the pixels of an image with 32 bits.

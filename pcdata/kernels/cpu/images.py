@@ -6,7 +6,6 @@ and all that goes along with them, where they belong.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,11 +14,9 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
-from pcdata.functional.depth.deproject import Deprojected, check_intrinsics, pixel_rays
+from pcdata.functional.depth.deproject import Deprojected, check_intrinsics
+from pcdata.kernels.cameras import Rays, depth_limits, images_fit, rays_of_cameras, region_fits
 from pcdata.kernels.cpu.native import addresses, call, numbers, room, room_for
-
-# x/z of every column (V, W) and y/z of every row (V, H), or both of every pixel (V, H, W, 2); float32.
-Rays = tuple[Tensor | None, Tensor | None, Tensor | None]
 
 
 @kernel("mask_depth", "cpu")
@@ -28,7 +25,7 @@ def mask_depth(depth: Tensor, near: float | None, far: float | None, mask: Tenso
     if mask is not None and (mask.shape != depth.shape or mask.dtype is not torch.bool):
         return INNER["mask_depth"].reference(depth, near, far, mask)
     masked = torch.empty_like(depth, memory_format=torch.contiguous_format)
-    limits = _limits(near, far)
+    limits = depth_limits(near, far)
     call("pc_mask_depth", depth.contiguous(), depth.numel(), *limits, _contiguous(mask), masked)
     return masked
 
@@ -53,7 +50,7 @@ def deproject_images(
     images: Mapping[str, Tensor],
 ) -> Deprojected:
     """Write the points and all that goes along with them."""
-    if not _fit(depth, intrinsics, distortion, colors, images):
+    if not images_fit(depth, intrinsics, distortion, colors, images):
         return INNER["deproject_images"].reference(depth, intrinsics, distortion, colors, images)
     cameras = _Cameras.of(depth, intrinsics, distortion)
     chosen = cameras.choose()
@@ -79,15 +76,11 @@ def deproject_into_box(
 ) -> tuple[Deprojected, Tensor] | None:
     """Write only what is inside the box."""
     chosen = None
-    if (
-        _fit(depth, intrinsics, distortion, colors, images)
-        and (mask is None or (mask.shape == depth.shape and mask.dtype is torch.bool))
-        and (matrix is None or matrix.shape == (len(depth), 4, 4))
-    ):
+    if images_fit(depth, intrinsics, distortion, colors, images) and region_fits(depth, matrix, mask):
         cameras = _Cameras.of(depth, intrinsics, distortion)
         matrix = None if matrix is None else matrix.double().contiguous()
         corners = depth.new_tensor(lower), depth.new_tensor(upper)
-        chosen = cameras.choose(_limits(near, far), mask, matrix, *corners)
+        chosen = cameras.choose(depth_limits(near, far), mask, matrix, *corners)
     if chosen is None:
         region = {"matrix": matrix, "lower": lower, "upper": upper, "near": near, "far": far, "mask": mask}
         return INNER["deproject_into_box"].reference(depth, intrinsics, distortion, colors, images, **region)
@@ -169,62 +162,5 @@ class _Cameras:
         return Deprojected(points, ptr, pixel_index, None if colors is None else rgb, dict(zip(sources, rows)))
 
 
-def _fit(
-    depth: Tensor,
-    intrinsics: Tensor,
-    distortion: Tensor | None,
-    colors: Tensor | None,
-    images: Mapping[str, Tensor],
-) -> bool:
-    """Whether the core may read as many cameras and pixels as there are depths: the callers are not all checked."""
-    views = len(depth)
-    cameras = intrinsics.shape == (views, 3, 3) and (distortion is None or len(distortion) == views)
-    rgb = colors is None or (colors.shape == (*depth.shape, 3) and colors.dtype is torch.uint8)
-    return cameras and rgb and all(image.shape[:3] == depth.shape for image in images.values())
-
-
-def _limits(near: float | None, far: float | None) -> tuple[float, float]:
-    return 0.0 if near is None else float(near), math.inf if far is None else float(far)
-
-
 def _contiguous(tensor: Tensor | None) -> Tensor | None:
     return None if tensor is None else tensor.contiguous()
-
-
-class _Key:
-    """A small tensor that a cache can look up by value."""
-
-    def __init__(self, tensor: Tensor) -> None:
-        self.tensor = tensor.detach().clone()
-        self.value = tensor.dtype, tuple(tensor.shape), tuple(tensor.flatten().tolist())
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and self.value == other.value
-
-    def __hash__(self) -> int:
-        return hash(self.value)
-
-
-def rays_of_cameras(intrinsics: Tensor, size: tuple[int, int], distortion: Tensor | None) -> Rays:
-    """Return the rays of columns and rows where they say all, else those of every pixel, kept for the next call."""
-    crossed = None if distortion is not None else _crossed_rays(_Key(intrinsics), size)
-    if crossed is not None:
-        return (*crossed, None)
-    return None, None, _cached_rays(_Key(intrinsics), size, None if distortion is None else _Key(distortion))
-
-
-@functools.lru_cache(maxsize=16)  # some kilobytes each
-def _crossed_rays(camera: _Key, size: tuple[int, int]) -> tuple[Tensor, Tensor] | None:
-    """Return x/z of every column (V, W) and y/z of every row (V, H); None if a skew makes x depend on the row."""
-    intrinsics = camera.tensor
-    if bool((intrinsics[:, 0, 1] != 0).any()):
-        return None
-    top = pixel_rays(intrinsics, (1, size[1]))[:, 0, :, 0]
-    left = pixel_rays(intrinsics, (size[0], 1))[:, :, 0, 1]
-    # An infinite y would make x NaN in the reference.
-    return (top.float().contiguous(), left.float().contiguous()) if bool(left.isfinite().all()) else None
-
-
-@functools.lru_cache(maxsize=4)  # 7 MB each at 1280x720: one per camera of a usual rig
-def _cached_rays(intrinsics: _Key, size: tuple[int, int], distortion: _Key | None) -> Tensor:
-    return pixel_rays(intrinsics.tensor, size, None if distortion is None else distortion.tensor).float().contiguous()

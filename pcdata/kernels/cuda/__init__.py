@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pcdata.kernels.cuda import clusters as cuda_clusters
+from pcdata.kernels.cuda import deprojection as cuda_deprojection
 from pcdata.kernels.cuda import neighbors as cuda_neighbors
 from pcdata.kernels.cuda import outliers as cuda_outliers
 from pcdata.kernels.cuda import planes as cuda_planes
@@ -12,6 +13,7 @@ from pcdata.kernels.cuda.gpu import unavailable
 
 __all__ = [
     "cuda_clusters",
+    "cuda_deprojection",
     "cuda_neighbors",
     "cuda_outliers",
     "cuda_planes",

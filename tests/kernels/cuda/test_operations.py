@@ -6,10 +6,12 @@ import pytest
 import torch
 
 from pcdata import functional as F
-from pcdata.contracts.dispatch import OPERATIONS
+from pcdata.contracts.dispatch import INNER, OPERATIONS
 from tests import pretend_device
+from tests.factories import assert_same
 from tests.functional.test_op_contract import EXAMPLES, call, clouds_of, packed
 from tests.kernels.cuda import harness
+from tests.kernels.cuda.inner_calls import CALLS
 
 pytestmark = pytest.mark.skipif(harness.unavailable() is not None, reason=str(harness.unavailable()))
 harness.register()
@@ -31,6 +33,13 @@ def test_it_gives_what_the_reference_gives(example, ordered):
             torch.testing.assert_close(found, wanted, rtol=1e-6, atol=1e-6)
         else:
             assert torch.equal(found, wanted)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_an_inner_function_gives_what_its_reference_gives(name, ordered):
+    assert harness.BACKEND in INNER[name].kernels
+    assert_same(CALLS[name](harness.BACKEND), CALLS[name]("torch"), tolerance=1e-6)
+    assert ordered.started
 
 
 @each_served
@@ -68,6 +77,8 @@ def test_every_kernel_is_run_by_some_operation():
         call(example, packed(example, clouds_of(example)), backend=harness.BACKEND)
         ran |= set(launcher.started)
     launcher = harness.use(0)
+    for run in CALLS.values():
+        run(harness.BACKEND)
     F.knn(torch.rand(1100, 3), k=1, backend=harness.BACKEND)  # parents of leaves
     F.statistical_outlier_mask(torch.rand(90, 3), num_neighbors=40, backend=harness.BACKEND)
     F.estimate_normals(torch.rand(90, 3), max_neighbors=40, backend=harness.BACKEND)

@@ -4,6 +4,7 @@
 #include "pc/gpu/box_tree.hpp"
 #include "pc/gpu/cell_table.hpp"
 #include "pc/gpu/clusters.hpp"
+#include "pc/gpu/deprojection.hpp"
 #include "pc/gpu/farthest.hpp"
 #include "pc/gpu/nearest.hpp"
 #include "pc/gpu/planes.hpp"

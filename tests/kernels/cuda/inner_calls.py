@@ -1,0 +1,41 @@
+"""Calls of inner functions that kernels of the GPU serve: name -> what runs it on a backend, with small made data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pcdata.functional.depth.deproject import deproject_images, deproject_into_box, mask_depth
+from pcdata.rng import seeded
+
+Call = Callable[[str], Any]
+
+
+def depth_images(shape: tuple[int, int, int] = (2, 21, 30), seed: int = 0, holes: float = 0.3) -> Tensor:
+    """Two slopes with a step between them, noise, and holes."""
+    drawn = torch.rand((2, *shape), generator=seeded(seed))
+    across = torch.linspace(0.5, 1.0, max(shape[2], 1))[: shape[2]]
+    slope = torch.where(across > 0.75, across + 0.4, across)
+    return torch.where(drawn[0] < holes, 0.0, slope + 0.01 * drawn[1])
+
+
+def cameras(shape: tuple[int, int, int] = (2, 21, 30)) -> Tensor:
+    views, height, width = shape
+    one = [[[60.0 + v, 0.0, width / 2 - 0.3], [0.0, 58.5, height / 2 + 0.2 * v], [0.0, 0.0, 1.0]] for v in range(views)]
+    return torch.tensor(one, dtype=torch.float64)
+
+
+def _box(backend: str) -> Any:
+    region = {"lower": (-0.2, -0.1, 0.5), "upper": (0.4, 0.3, 1.9), "near": 0.5, "far": 2.0, "mask": None}
+    matrix = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+    return deproject_into_box(depth_images(), cameras(), None, None, {}, matrix=matrix, **region, backend=backend)
+
+
+CALLS: dict[str, Call] = {
+    "mask_depth": lambda backend: mask_depth(depth_images(), 0.6, 1.2, None, backend=backend),
+    "deproject_images": lambda backend: deproject_images(depth_images(), cameras(), None, None, {}, backend=backend),
+    "deproject_into_box": _box,
+}
