@@ -11,11 +11,11 @@ from pcdata.contracts.dispatch import why_unavailable
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 LIMITS = {  # calls, files; counted with Python before 3.12, where comprehensions are calls
-    "points": (433, 40),  # sampling is told its options by the reference, whose step a kernel does; so is the way back;
-    # what a step has found is kept for the next, selections are run together, other devices are asked by name
-    "live": (803, 48),  # of eight steps in five passes; a plane is searched in as many rounds as it takes
+    "points": (434, 41),  # sampling is told its options by the reference, whose step a kernel does; so is the way back;
+    # what a step has found is kept for the next, selections are run together, other devices are asked by name; backends share rays
+    "live": (804, 49),  # of eight steps in five passes; a plane is searched in as many rounds as it takes
     "build": (
-        3472,
+        3473,
         114,  # the options have a file of their own, and so do what the core finds of planes, and motions
     ),  # of which 600 keep what a build was when it is stopped, 700 write its card, 30 tell rows, 16 look at poses, 56
     # have the hull and the rows of a plane found by the core, on one thread of torch's, 15 and 2 files tell its surface

@@ -49,7 +49,7 @@ class _Key:
     """A small tensor that a cache can look up by value."""
 
     def __init__(self, tensor: Tensor) -> None:
-        self.tensor = on_host(tensor).clone()
+        self.tensor = (tensor if tensor.device.type == "cpu" else on_host(tensor)).detach().clone()
         self.value = tensor.dtype, tuple(tensor.shape), tuple(self.tensor.flatten().tolist())
 
     def __eq__(self, other: object) -> bool:
