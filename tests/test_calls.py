@@ -12,7 +12,7 @@ from pcdata.contracts.dispatch import why_unavailable
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 LIMITS = {  # calls, files; counted with Python before 3.12, where comprehensions are calls
     "points": (434, 41),  # sampling is told its options by the reference, whose step a kernel does; so is the way back;
-    # what a step has found is kept for the next, selections are run together, other devices are asked by name; backends share rays
+    # what a step has found is kept for the next, selections are run together, others are asked by name, rays shared
     "live": (804, 49),  # of eight steps in five passes; a plane is searched in as many rounds as it takes
     "build": (
         3473,

@@ -7,6 +7,7 @@ from pcdata.kernels.cuda import deprojection as cuda_deprojection
 from pcdata.kernels.cuda import neighbors as cuda_neighbors
 from pcdata.kernels.cuda import outliers as cuda_outliers
 from pcdata.kernels.cuda import planes as cuda_planes
+from pcdata.kernels.cuda import registration as cuda_registration
 from pcdata.kernels.cuda import sampling as cuda_sampling
 from pcdata.kernels.cuda import voxels as cuda_voxels
 from pcdata.kernels.cuda.gpu import unavailable
@@ -17,6 +18,7 @@ __all__ = [
     "cuda_neighbors",
     "cuda_outliers",
     "cuda_planes",
+    "cuda_registration",
     "cuda_sampling",
     "cuda_voxels",
     "unavailable",

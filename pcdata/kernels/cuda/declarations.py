@@ -55,22 +55,22 @@ class Kernel(NamedTuple):
 @functools.cache
 def kernels() -> dict[str, Kernel]:
     """Read all headers; return the kernels by name."""
-    found: dict[str, Kernel] = {}
-    for header in sorted((SOURCES / "pc" / "gpu").glob("*.hpp")):
-        for kernel in declared(read_text("pcdata kernels", header), header.stem):
-            found[kernel.name] = kernel
-    return found
+    headers = sorted((SOURCES / "pc" / "gpu").glob("*.hpp"))
+    texts = {header.stem: read_text("pcdata kernels", header) for header in headers}
+    shared = "\n".join(texts.values())
+    return {kernel.name: kernel for theme, text in texts.items() for kernel in declared(text, theme, shared)}
 
 
-def declared(text: str, theme: str) -> list[Kernel]:
-    """Return the kernels of one header.
+def declared(text: str, theme: str, shared: str = "") -> list[Kernel]:
+    """Return the kernels of one header; ``shared`` defines parameters as well.
 
     Raises:
         ValueError: an argument is no pointer, int64_t or double.
     """
-    text = re.sub(r"//[^\n]*", "", text)
-    for name, parameters in reversed(_DEFINED.findall(text)):  # that several kernels share
-        text = re.sub(rf"(?<!#define )\b{name}\b", parameters.replace("\\", " "), text)
+    text, shared = (re.sub(r"//[^\n]*", "", one) for one in (text, shared))
+    definitions = {name: parameters.replace("\\", " ") for name, parameters in _DEFINED.findall(shared + text)}
+    while used := next((name for name in definitions if re.search(rf"(?<!#define )\b{name}\b", text)), None):
+        text = re.sub(rf"(?<!#define )\b{used}\b", definitions[used], text)
     return [
         Kernel(name, theme, KINDS[kind], tuple(_parameter(name, one) for one in listed.split(",")))
         for kind, name, listed in _KERNEL.findall(text)

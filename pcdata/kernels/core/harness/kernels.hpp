@@ -9,5 +9,6 @@
 #include "pc/gpu/nearest.hpp"
 #include "pc/gpu/planes.hpp"
 #include "pc/gpu/radius.hpp"
+#include "pc/gpu/registration.hpp"
 #include "pc/gpu/unusual.hpp"
 #include "pc/gpu/voxels.hpp"

@@ -34,12 +34,10 @@ struct PixelCells {
       : left(room), right(room + width), top(room + 2 * width), bottom(room + 3 * width) {}
 };
 
-float lower(float a, float b) { return a < b ? a : b; }
-float upper(float a, float b) { return a > b ? a : b; }
-
 // The mean coordinates at the inner corners between two rows of pixels.
 void average(const float* __restrict above, const float* __restrict below, int64_t width, float* __restrict corners) {
-  for (int64_t i = 0; i + 1 < width; ++i) corners[i] = 0.25F * ((below[i + 1] + above[i + 1]) + (below[i] + above[i]));
+  for (int64_t i = 0; i + 1 < width; ++i)
+    corners[i] = math::corner_between(above[i], above[i + 1], below[i], below[i + 1]);
 }
 
 // The corners between two rows of pixels; the outer ones keep what they are, not linked.
@@ -50,11 +48,8 @@ void link(const ProjectedRow& seen_above, const ProjectedRow& seen_below, int64_
   const float* __restrict above = seen_above.reading;
   const float* __restrict below = seen_below.reading;
   int32_t* __restrict linked = corners.linked + 1;
-  for (int64_t i = 0; i + 1 < width; ++i) {
-    const float low = lower(lower(above[i], below[i]), lower(above[i + 1], below[i + 1]));
-    const float high = upper(upper(above[i], below[i]), upper(above[i + 1], below[i + 1]));
-    linked[i] = (low > 0) & (high - low <= max_jump * low);
-  }
+  for (int64_t i = 0; i + 1 < width; ++i)
+    linked[i] = math::on_one_surface(above[i], below[i], above[i + 1], below[i + 1], max_jump);
 }
 
 // One coordinate's ends of a row of cells, from the corners above and below, cut to [0, limit).
@@ -68,19 +63,19 @@ void cut_cells(const float* __restrict center, const float* __restrict half, con
   for (int64_t i = 0; i < width; ++i) {
     const int32_t a = linked_above[i], b = linked_above[i + 1], c = linked_below[i], d = linked_below[i + 1];
     float low = kInfinity, high = -kInfinity;
-    low = lower(low, a ? above[i] : kInfinity);
-    high = upper(high, a ? above[i] : -kInfinity);
-    low = lower(low, b ? above[i + 1] : kInfinity);
-    high = upper(high, b ? above[i + 1] : -kInfinity);
-    low = lower(low, c ? below[i] : kInfinity);
-    high = upper(high, c ? below[i] : -kInfinity);
-    low = lower(low, d ? below[i + 1] : kInfinity);
-    high = upper(high, d ? below[i + 1] : -kInfinity);
+    low = math::lower(low, a ? above[i] : kInfinity);
+    high = math::upper(high, a ? above[i] : -kInfinity);
+    low = math::lower(low, b ? above[i + 1] : kInfinity);
+    high = math::upper(high, b ? above[i + 1] : -kInfinity);
+    low = math::lower(low, c ? below[i] : kInfinity);
+    high = math::upper(high, c ? below[i] : -kInfinity);
+    low = math::lower(low, d ? below[i + 1] : kInfinity);
+    high = math::upper(high, d ? below[i + 1] : -kInfinity);
     const float reach = (a & b & c & d) ? -kInfinity : half[i];  // reaches nowhere
-    low = lower(low, center[i] - reach);
-    high = upper(high, center[i] + reach);
-    first[i] = static_cast<int32_t>(lower(upper(std::ceil(low), 0.0F), most));
-    end[i] = static_cast<int32_t>(lower(upper(std::ceil(high), 0.0F), most));
+    low = math::lower(low, center[i] - reach);
+    high = math::upper(high, center[i] + reach);
+    first[i] = static_cast<int32_t>(math::lower(math::upper(std::ceil(low), 0.0F), most));
+    end[i] = static_cast<int32_t>(math::lower(math::upper(std::ceil(high), 0.0F), most));
   }
 }
 
@@ -232,7 +227,8 @@ PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* dept
         view.column_rays = column_rays + number * width;
         view.row_rays = row_rays + number * height;
       }
-      view.set_cameras(color_from_depth + 16 * number, color_intrinsics + 9 * number, half_pixels + 2 * number);
+      view.camera = math::ColorCamera::of(color_from_depth + 16 * number, color_intrinsics + 9 * number,
+                                          half_pixels + 2 * number);
       view.lens = lenses == nullptr ? nullptr : &lens;
 
       float* image = registered + number * color_pixels;

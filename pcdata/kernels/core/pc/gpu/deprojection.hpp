@@ -18,18 +18,16 @@ struct DepthImages {
   PC_HD int64_t pixels() const { return views * height * width; }
   PC_HD int64_t view_of(int64_t pixel) const { return pixel / (height * width); }
   PC_HD bool has_ray(int64_t pixel) const { return rays == nullptr || rays[2 * pixel] == rays[2 * pixel]; }
+  PC_HD math::Ray ray(int64_t pixel) const {
+    if (rays != nullptr) return {rays[2 * pixel], rays[2 * pixel + 1]};
+    const int64_t row = pixel / width;
+    return {column_rays[row / height * width + (pixel - row * width)], row_rays[row]};
+  }
   PC_HD math::Point point(int64_t pixel) const {
+    const math::Ray along = ray(pixel);
     const float z = depth[pixel];
-    const int64_t row = pixel / width, view = row / height;
-    math::Point p{0, 0, z};
-    if (rays != nullptr) {
-      p.x = rays[2 * pixel] * z;
-      p.y = rays[2 * pixel + 1] * z;
-    } else {
-      p.x = column_rays[view * width + (pixel - row * width)] * z;
-      p.y = row_rays[row] * z;
-    }
-    return matrices == nullptr ? p : math::Affine(matrices + 16 * view)(p);
+    const math::Point p{along.x * z, along.y * z, z};
+    return matrices == nullptr ? p : math::Affine(matrices + 16 * view_of(pixel))(p);
   }
 };
 

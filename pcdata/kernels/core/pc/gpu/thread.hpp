@@ -54,6 +54,7 @@ PC_HD int64_t atomic_add(int64_t* place, int64_t value) {
   return static_cast<int64_t>(atomicAdd(reinterpret_cast<unsigned long long*>(place), static_cast<uint64_t>(value)));
 }
 PC_HD int32_t atomic_min(int32_t* place, int32_t value) { return atomicMin(place, value); }
+PC_HD uint64_t atomic_min(uint64_t* place, uint64_t value) { return atomicMin(place, value); }
 PC_HD int32_t atomic_max(int32_t* place, int32_t value) { return atomicMax(place, value); }
 PC_HD uint64_t atomic_max(uint64_t* place, uint64_t value) { return atomicMax(place, value); }
 PC_HD int32_t atomic_swap_if(int32_t* place, int32_t expected, int32_t value) {

@@ -9,6 +9,11 @@ struct Point {
   float x, y, z;
 };
 
+// Where a pixel looks: x/z and y/z.
+struct Ray {
+  float x, y;
+};
+
 PC_HD bool is_finite(Point p) { return (p.x * 0 + p.y * 0) + p.z * 0 == 0; }  // 0 * inf and 0 * NaN are NaN
 
 // The upper three rows of a 4x4 matrix that acts on column vectors.
