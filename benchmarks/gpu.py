@@ -34,7 +34,7 @@ from pcdata import transforms as T
 from pcdata.contracts import dispatch
 from pcdata.kernels.cuda import launching
 from pcdata.rng import seeded
-from pcdata.structures import TSDFVolume
+from pcdata.structures import DepthFrame, TSDFVolume
 from pcdata.synthetic import tabletop
 from tests.factories import differences, tree
 from tests.functional import test_op_contract as operations
@@ -218,13 +218,32 @@ def timing_cases(device: torch.device, size: tuple[int, int]) -> Iterator[tuple[
         lambda: F.farthest_point_sample(many, ptr, num_samples=few),
     )
     yield "normals 2 cm, 30", 0.6, lambda: F.estimate_normals(points, radius=0.02, max_neighbors=30, grid=grid)
-    yield "flying pixels", None, lambda: F.flying_pixel_mask(frame.depth)
+    yield from depth_cases(frame)
     yield "16 nearest", None, lambda: F.knn(points, k=16)
     yield "chain to 1024 points", 3.0, lambda: chain(frame)
     yield "chain to 1024 points, four clouds", 4.0, lambda: [chain(frame) for _ in range(4)]
     volume = TSDFVolume(voxel_size=0.004, backend="auto", device=device)
     yield "TSDF 4 mm, integrate", 0.3, lambda: volume.integrate(frame)
     yield "TSDF 4 mm, extract", 0.5, lambda: volume.extract_points()
+
+
+def depth_cases(frame: DepthFrame) -> Iterator[tuple[str, float | None, Callable[[], Any]]]:
+    """Yield what is done with depth images before they are points."""
+    depth, intrinsics, identity = frame.depth, frame.camera.intrinsics, frame.depth.new_zeros((1, 4, 4)).double()
+    identity[:] = torch.eye(4, dtype=torch.float64, device="cpu").to(depth.device)
+    size, disparity = frame.size, F.spatial_filter(30 / depth.clamp(min=0.1))
+    yield "deproject", 0.05, lambda: F.deproject_depth(depth, intrinsics)
+    yield (
+        "register depth to color",
+        None,
+        lambda: F.register_depth(depth, intrinsics, intrinsics, identity, color_size=size),
+    )
+    yield "decimate depth by 2", None, lambda: F.decimate_depth(depth, factor=2)
+    yield "flying pixels", None, lambda: F.flying_pixel_mask(depth)
+    yield "spatial filter", None, lambda: F.spatial_filter(disparity)
+    yield "bilateral filter 5 x 5", None, lambda: F.bilateral_filter(depth)
+    yield "median filter 3 x 3", None, lambda: F.median_filter(depth)
+    yield "fill holes", None, lambda: F.fill_holes(depth)
 
 
 def timed(name: str, goal: float | None, call: Callable[[], Any], device: torch.device) -> dict[str, Any]:

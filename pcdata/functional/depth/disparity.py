@@ -17,7 +17,7 @@ STEPS_PER_PIXEL = 32
 
 # Holes during the filter: so far from any disparity that no step to or from them is small, yet finite, because the
 # recursion multiplies what it does not use by zero, and zero times infinity would be NaN.
-_HOLE = -1e30
+LINE_HOLE = -1e30
 _LARGEST_STEP = 1e29  # so it is for thresholds up to infinity
 
 
@@ -57,7 +57,7 @@ def smoothed_images(values: Tensor, scale: Tensor | None, alpha: float, delta: f
         disparity = smoothed_images(reciprocals(values, scale), None, alpha, delta, iterations)
         return reciprocals(disparity, scale)
     # The axis gone along comes first, so that every step reads and writes contiguous memory.
-    rows = torch.where(values > 0, values, _HOLE).permute(1, 0, 2).contiguous()  # (H, V, W)
+    rows = torch.where(values > 0, values, LINE_HOLE).permute(1, 0, 2).contiguous()  # (H, V, W)
     columns = torch.empty_like(rows.permute(2, 1, 0), memory_format=torch.contiguous_format)  # (W, V, H)
     for _ in range(iterations):
         columns.copy_(rows.permute(2, 1, 0))

@@ -40,7 +40,7 @@ def fill_holes(
     further downwards and to the right than upwards.
     """
     hole = depth == 0
-    wanted = hole if max_size is None else hole & ~_wide(hole, max_size + 1)
+    wanted = hole if max_size is None else hole & ~wide_holes(hole, max_size + 1)
     if rule == "left":
         return _fill_from_left(depth, wanted)
     return _fill_inwards(depth, wanted, farthest=rule == "farthest")
@@ -122,7 +122,7 @@ def _fill_inwards(depth: Tensor, wanted: Tensor, *, farthest: bool) -> tuple[Ten
     )
 
 
-def _wide(hole: Tensor, side: int) -> Tensor:
+def wide_holes(hole: Tensor, side: int) -> Tensor:
     """Mark the pixels over which a square of ``side`` pixels that is all hole fits within the image: an opening."""
     height, width = hole.shape[1:]
     if side > height or side > width:

@@ -126,8 +126,13 @@ def resize_depth(
     farthest = torch.maximum(torch.maximum(corners[0], corners[1]), torch.maximum(corners[2], corners[3]))
     one_surface = (closest > 0) & (farthest - closest <= max_jump * closest)
     inverse = [1 / torch.where(one_surface, corner, 1.0) for corner in corners]  # 1 / 0 has no gradient
-    top, bottom = torch.lerp(inverse[0], inverse[1], across), torch.lerp(inverse[2], inverse[3], across)
-    return torch.where(one_surface, 1 / torch.lerp(top, bottom, down[:, None]), nearest), pixel_index
+    top, bottom = _mixed(inverse[0], inverse[1], across), _mixed(inverse[2], inverse[3], across)
+    return torch.where(one_surface, 1 / _mixed(top, bottom, down[:, None]), nearest), pixel_index
+
+
+def _mixed(first: Tensor, second: Tensor, part: Tensor) -> Tensor:
+    """Go from the first to the second; not by lerp, which rounds once or twice as the processor has it."""
+    return first + part * (second - first)
 
 
 def _centers(old: int, new: int, device: torch.device) -> Tensor:

@@ -8,7 +8,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.functional.depth.confidence import filled_confidence
 from pcdata.functional.depth.deproject import deproject_images, deproject_into_box, mask_depth
+from pcdata.functional.depth.disparity import reciprocals, smoothed_images
+from pcdata.functional.depth.flying_pixels import without_flying_pixels
+from pcdata.functional.depth.holes import fill_rows, filled_images
+from pcdata.functional.depth.temporal import temporal_step
 from pcdata.rng import seeded
 
 Call = Callable[[str], Any]
@@ -34,8 +39,25 @@ def _box(backend: str) -> Any:
     return deproject_into_box(depth_images(), cameras(), None, None, {}, matrix=matrix, **region, backend=backend)
 
 
+def _over_time(backend: str) -> Any:
+    history = torch.randint(0, 256, (2, 21, 30), generator=seeded(3), dtype=torch.uint8)
+    return temporal_step(depth_images(), None, depth_images(seed=1), history, 0.4, 0.05, 3, backend=backend)
+
+
+def _filled_confidence(backend: str) -> Any:
+    before = depth_images()
+    return filled_confidence(before, torch.where(before > 0, before, 0.5), None, None, backend=backend)
+
+
 CALLS: dict[str, Call] = {
     "mask_depth": lambda backend: mask_depth(depth_images(), 0.6, 1.2, None, backend=backend),
     "deproject_images": lambda backend: deproject_images(depth_images(), cameras(), None, None, {}, backend=backend),
     "deproject_into_box": _box,
+    "reciprocals": lambda backend: reciprocals(depth_images(), torch.tensor([20.0, 30.0]), backend=backend),
+    "smoothed_images": lambda backend: smoothed_images(depth_images(), None, 0.5, 0.1, 1, backend=backend),
+    "temporal_step": _over_time,
+    "without_flying_pixels": lambda backend: without_flying_pixels(depth_images(), None, 0.02, 3, backend=backend),
+    "filled_images": lambda backend: filled_images(depth_images(), "farthest", 3, 1, backend=backend),
+    "fill_rows": lambda backend: fill_rows(depth_images(), 2, backend=backend),
+    "filled_confidence": _filled_confidence,
 }

@@ -34,9 +34,9 @@ static_assert(sizeof(math::Lens) == 14 * sizeof(double), "lenses are rows of 14 
 #define PC_REGISTRATION_PARAMETERS                                                            \
   PC_DEPTH_IMAGES_PARAMETERS, const double *color_from_depth, const double *color_intrinsics, \
       const double *half_pixels, const double *lenses, float *seen
-#define PC_REGISTRATION                                                                \
-  PC_DEPTH_IMAGES;                                                                     \
-  const ColorCameras cameras{color_from_depth, color_intrinsics, half_pixels, lenses}; \
+#define PC_REGISTRATION                                                                                 \
+  PC_DEPTH_IMAGES;                                                                                      \
+  [[maybe_unused]] const ColorCameras cameras{color_from_depth, color_intrinsics, half_pixels, lenses}; \
   const SeenReadings readings { seen, images.pixels() }
 
 // Project every reading. Sets `impossible` (1,) where one has no ray, or projects so far off that floats cannot be

@@ -23,6 +23,16 @@ using uint64_t = unsigned long long;
 
 namespace pc::math {
 
+PC_HD float float_of_bits(uint32_t bits) {
+#if defined(__CUDACC__)
+  return __uint_as_float(bits);
+#else
+  float value;
+  __builtin_memcpy(&value, &bits, sizeof value);
+  return value;
+#endif
+}
+
 PC_HD double larger(double a, double b) { return a > b ? a : b; }
 
 }  // namespace pc::math

@@ -2,6 +2,7 @@
 // are seen, and the cells between their corners.
 #pragma once
 
+#include "pc/math/depth.hpp"
 #include "pc/math/lens.hpp"
 
 namespace pc::math {
@@ -9,9 +10,6 @@ namespace pc::math {
 // Beyond it sums of coordinates could overflow, and what infinities become is the reference's to say.
 constexpr float kFarthestPixel = 1e30F;
 constexpr float kNoEnd = 3e38F;  // farther than any
-
-PC_HD float lower(float a, float b) { return a < b ? a : b; }
-PC_HD float upper(float a, float b) { return a > b ? a : b; }
 
 // A reading in the color camera: x/z and y/z, z, and the depth that was read, 0 where the camera cannot see it.
 struct MovedReading {
@@ -71,12 +69,6 @@ PC_HD MovedReading bent(const Lens& lens, const MovedReading& moved) {
   MovedReading found{visible ? moved.x : 0.0F, visible ? moved.y : 0.0F, moved.z, visible ? moved.reading : 0.0F};
   lens.bend(found.x, found.y);
   return found;
-}
-
-// Whether the four readings around a corner lie on one surface.
-PC_HD bool on_one_surface(float a, float b, float c, float d, float max_jump) {
-  const float low = lower(lower(a, b), lower(c, d)), high = upper(upper(a, b), upper(c, d));
-  return (low > 0) & (high - low <= max_jump * low);
 }
 
 // The corner between two pixels above and two below.
