@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import json
 import statistics
 import sys
@@ -22,6 +23,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +35,7 @@ from pcdata import functional as F
 from pcdata import transforms as T
 from pcdata.contracts import dispatch
 from pcdata.kernels.cuda import launching
+from pcdata.live import LivePipeline
 from pcdata.rng import seeded
 from pcdata.structures import DepthFrame, TSDFVolume
 from pcdata.synthetic import tabletop
@@ -222,6 +225,8 @@ def timing_cases(device: torch.device, size: tuple[int, int]) -> Iterator[tuple[
     yield "16 nearest", None, lambda: F.knn(points, k=16)
     yield "chain to 1024 points", 3.0, lambda: chain(frame)
     yield "chain to 1024 points, four clouds", 4.0, lambda: [chain(frame) for _ in range(4)]
+    for cameras, goal in ((1, 2.0), (4, 4.0)):
+        yield f"captured chain, {cameras} cameras", goal, live_call(cameras, size, device, chain)
     volume = TSDFVolume(voxel_size=0.004, backend="auto", device=device)
     yield "TSDF 4 mm, integrate", 0.3, lambda: volume.integrate(frame)
     yield "TSDF 4 mm, extract", 0.5, lambda: volume.extract_points()
@@ -244,6 +249,23 @@ def depth_cases(frame: DepthFrame) -> Iterator[tuple[str, float | None, Callable
     yield "bilateral filter 5 x 5", None, lambda: F.bilateral_filter(depth)
     yield "median filter 3 x 3", None, lambda: F.median_filter(depth)
     yield "fill holes", None, lambda: F.fill_holes(depth)
+
+
+def live_call(cameras: int, size: tuple[int, int], device: torch.device, chain: T.Compose) -> Callable[[], Any]:
+    """Return a call that answers the next of two frames, as a stream gives them."""
+    made = [tabletop(seed, noise="stereo", size=size, num_views=cameras).frame for seed in (0, 1)]
+    frames = [replace(one, camera=made[0].camera, labels=None).to(device) for one in made]
+    live = LivePipeline(chain, like=frames[0])
+    print(f"captured for {cameras} cameras: {', '.join(live.captured) or 'nothing'}", flush=True)
+    turns = itertools.cycle(frames[::-1])
+
+    def call() -> Any:
+        result = live(next(turns))
+        if result.cloud is None:
+            raise RuntimeError(f"{result.fault}: {result.reason}")
+        return result.cloud
+
+    return call
 
 
 def timed(name: str, goal: float | None, call: Callable[[], Any], device: torch.device) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import traceback
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -68,6 +68,49 @@ class Watched:
 
 
 _watching: list[Watched] = []
+
+
+class Recording:
+    """What the device was asked to do, in order, to be done again: as a CUDA graph, with the same memory.
+
+    What a graph cannot hold is refused: the host waits for a value, or sends one.
+    """
+
+    def __init__(self) -> None:
+        self.done: list[tuple[str, Callable[[], None]]] = []  # what it is, with all that it is asked with
+        self.kept: list[Any] = []  # memory that is written to again
+
+    def add(self, what: str, again: Callable[[], None], *kept: Any) -> None:
+        self.done.append((what, again))
+        self.kept.append(kept)
+
+    def add_operation(self, name: str, function: Any, arguments: tuple, options: dict, found: Any) -> None:
+        results = list(_plain_tensors((found,)))
+
+        def again() -> None:
+            for into, one in zip(results, _plain_tensors((function(*arguments, **options),)), strict=True):
+                if into is not one:
+                    assert into.shape == one.shape, f"aten::{name} gives another size"
+                    into.copy_(one)
+
+        self.add(f"aten::{name}", again, found, arguments, options)
+
+    def replay(self) -> None:
+        for _, again in self.done:
+            again()
+
+
+_recordings: list[Recording] = []
+
+
+@contextmanager
+def recording() -> Iterator[Recording]:
+    made = Recording()
+    _recordings.append(made)
+    try:
+        yield made
+    finally:
+        _recordings.pop()
 
 
 @contextmanager
@@ -162,6 +205,10 @@ def run(function: Any, arguments: tuple, options: dict) -> Any:
             watched.launches += 1
     inner_options = {key: HOST if isinstance(value, torch.device) else value for key, value in options.items()}
     found = function(*tree_map(_inner, arguments), **tree_map(_inner, inner_options))
+    for made in _recordings:
+        if name not in VIEWS:
+            made.add_operation(name, function, tree_map(_inner, arguments), tree_map(_inner, inner_options), found)
+        made.kept.append(found)
     if name == "copy_" and not isinstance(arguments[0], PretendTensor):
         return arguments[0]
     if to_host:
@@ -199,13 +246,23 @@ def _tensors_in(values: Any) -> Iterator[Tensor]:
             yield from _tensors_in(value)
 
 
+def _plain_tensors(values: Any) -> Iterator[Tensor]:
+    for value in values:
+        if isinstance(value, Tensor):
+            yield value
+        elif isinstance(value, list | tuple):
+            yield from _plain_tensors(value)
+
+
 def _waited(what: str) -> None:
+    if _recordings:
+        raise RuntimeError(f"a graph cannot hold what the host waits for: {what} in {_place()}")
     for watched in _watching:
         watched.waits[f"{what} in {_place()}"] += 1
 
 
 def _uploaded(what: str, *, waits: bool) -> None:
-    if waits:
+    if waits or _recordings:
         _waited(f"upload by {what}")
     for watched in _watching:
         watched.uploads[f"{what} in {_place()}"] += 1
@@ -251,6 +308,12 @@ def _copy_from(source: Tensor, target: Tensor, non_blocking: bool = False) -> Te
 
 def _factory(function: Any) -> Any:
     def make(*arguments: Any, **options: Any) -> Tensor:
-        return PretendTensor(function(*arguments, **{**options, "device": HOST}))
+        options = {**options, "device": HOST}
+        found = function(*arguments, **options)
+        for recorded in _recordings:
+            if not function._schema.name.startswith("aten::empty"):
+                recorded.add_operation(function._schema.name, function, arguments, options, found)
+            recorded.kept.append(found)
+        return PretendTensor(found)
 
     return make

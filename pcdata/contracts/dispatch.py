@@ -66,6 +66,7 @@ class _Operation:
     mutates: tuple[str, ...] = ()  # arguments that it changes in place
     steps: tuple[str, ...] = ()  # inner functions that the reference tells its backend
     kernels: dict[str, Callable[..., Any]] = field(default_factory=dict)
+    roomy: set[str] = field(default_factory=set)  # backends whose kernel takes arrays with room: see kernel()
 
     def serves(self, backend: str) -> bool:
         """Say whether a backend, once loaded, computes this operation."""
@@ -156,18 +157,38 @@ def inner(reference: Callable[P, R]) -> Callable[P, R]:
     return function
 
 
-def kernel(name: str, backend: str) -> Callable[[Callable[P, R]], Callable[P, R]]:
+def kernel(name: str, backend: str, *, roomy: bool = False) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Register a faster body of operation ``name``; it is called with keyword arguments and no ``backend``.
 
     The body of an inner function is called as the function was.
+
+    Args:
+        name: of the operation.
+        backend: that it is a body of.
+        roomy: its arrays may have room for more rows than their ``ptr`` counts; what lies behind the last is finite and
+            changes nothing. Its results have as much room. It waits for the device at most in
+            :func:`pcdata.contracts.asked_later.is_set`, so what it starts may be repeated on other values: see
+            :func:`roomy_body`.
     """
 
     def decorate(body: Callable[P, R]) -> Callable[P, R]:
         registry = OPERATIONS if name in OPERATIONS else INNER
         registry[name].kernels[backend] = body
+        if roomy:
+            registry[name].roomy.add(backend)
         return body
 
     return decorate
+
+
+def roomy_body(name: str, device: torch.device) -> Callable[..., Any] | None:
+    """Return the body of an operation that takes arrays with room for more rows than their ``ptr`` counts, or None.
+
+    It gets what :func:`op` would have checked, and nobody checks it.
+    """
+    operation = OPERATIONS.get(name) or INNER[name]
+    backend = first_live(device, operation.serves)
+    return operation.kernels[backend] if backend in operation.roomy else None
 
 
 @functools.cache

@@ -67,7 +67,7 @@ class ArrayReader:
         if pose is not None:
             made["world_from_camera"] = pose_tensor(WHERE, pose, shape[0])
             check_rigid(f"{WHERE}: pose", made["world_from_camera"])
-        return derived(like, **{name: value.to(like.device) for name, value in made.items()})
+        return derived(like, **{name: value.to(like.device, non_blocking=True) for name, value in made.items()})
 
     def _depth(self, stored: NDArray[Any], keep: Tensor | None) -> Tensor:
         if self._dtype is None:
@@ -106,6 +106,6 @@ class ArrayReader:
 
     def give_away(self, tensors: list[Tensor]) -> None:
         """Never write again into memory that these tensors share: they are somebody else's now."""
-        theirs = {tensor.untyped_storage().data_ptr() for tensor in tensors}
+        theirs = {tensor.untyped_storage().data_ptr() for tensor in tensors if tensor.device.type == "cpu"}
         for rooms in self._rooms.values():
             rooms[:] = [room for room in rooms if room.untyped_storage().data_ptr() not in theirs]

@@ -46,14 +46,16 @@ def check_like(frame: DepthFrame, like: DepthFrame) -> None:
         )
 
 
-def has_readings(depth: Tensor) -> bool:
-    """Say whether a pixel is not 0.
+def has_readings(depth: Tensor, extremes: tuple[float, float] | None = None) -> bool:
+    """Say whether a pixel is not 0; ``extremes``: the least and the largest where they are known.
 
     Raises:
         NonFiniteError: NaN or infinite depth, which a capture cannot be made with, but changed to.
         CaptureError: negative depth.
     """
-    if depth.device.type == "cpu":  # NaN is the least and the largest wherever there is one
+    if extremes is not None:
+        least, largest = extremes
+    elif depth.device.type == "cpu":  # NaN is the least and the largest wherever there is one
         values = depth.detach().numpy()
         least, largest = float(values.min()), float(values.max())
     else:

@@ -28,6 +28,7 @@ from pcdata.errors import (
 from pcdata.live.arrays import ArrayReader
 from pcdata.live.faults import Fault, LiveResult, StalledError
 from pcdata.live.first_frame import check_like, has_readings, same_pixels
+from pcdata.live.fixed_frames import FixedFrames, Seen
 from pcdata.live.latency import Histogram
 from pcdata.live.latest_frame import LatestFrame
 from pcdata.live.over_time import OverTime
@@ -115,9 +116,12 @@ class LivePipeline:
         self._turn = Lock()  # held while a frame is worked on
         self._names = [type(step).__name__ for step in self.chain.steps]
         self._number = 0
+        self._fixed: FixedFrames | None = None
         self.reset_stats()
         if self._run(like) is None:
             raise ConfigError("LivePipeline: the chain gives no clouds; put Deproject into it")
+        self._fixed = FixedFrames.of(list(self.chain.steps), like)
+        self._rest = self.chain.steps_from(0 if self._fixed is None else len(self._fixed.steps))
         self.reset_stats()
 
     def _check_chain(self, seed: int | None) -> None:
@@ -182,22 +186,25 @@ class LivePipeline:
                 frame = given
             else:
                 frame = self._arrays.frame(given, colors, confidence, pose, keep=self._last)
-            is_empty = not has_readings(frame.depth)
+            seen = None if self._fixed is None else self._looked_at(frame)
+            is_empty = not has_readings(frame.depth, None if seen is None else (seen.least, seen.largest))
         except Exception as error:
             fault = next((fault for kind, fault in _KINDS if isinstance(error, kind)), Fault.OTHER_FORM)
             return None, fault, str(error)
         if is_empty:
             return None, Fault.EMPTY, "LivePipeline: not one pixel has a reading; is the lens covered?"
-        if self._same_pixels and self._last is not None and same_pixels(frame.depth, self._last):
+        if self._same_pixels and (
+            seen.is_same if seen is not None else self._last is not None and same_pixels(frame.depth, self._last)
+        ):
             return None, Fault.FROZEN, "LivePipeline: every pixel is that of the frame before; does the camera stream?"
-        if self._same_pixels:
+        if self._same_pixels and seen is None:
             self._remember(frame.depth, is_own=frame is not given)
         try:
             if self.before is not None:
                 since = time.perf_counter()
                 frame = self.before(frame, stamp)
                 self._count(type(self.before).__name__, time.perf_counter() - since)
-            cloud = self._run(frame)
+            cloud = self._run(frame, seen)
         except NonFiniteError as error:
             return None, Fault.BAD_VALUES, str(error)
         except Exception as error:
@@ -217,20 +224,37 @@ class LivePipeline:
         self._copy.copy_(depth)
         self._last = self._copy
 
-    def _run(self, frame: DepthFrame) -> PointCloud:
-        """Run the chain and count how long each pass took."""
+    def _looked_at(self, frame: DepthFrame) -> Seen | None:
+        """Run the captured steps on a frame; None where there are none, or a filter comes before them."""
+        if self._fixed is None or self.before is not None:
+            return None
+        self._since = time.perf_counter()
+        return self._fixed.look(frame)
+
+    def _run(self, frame: DepthFrame, seen: Seen | None = None) -> PointCloud:
+        """Run the chain, behind what was captured, and count how long each pass took."""
         seed = self._seed
         generator = None if seed is None else torch.Generator("cpu").manual_seed(seed)
-        since = time.perf_counter()
+        chain, done, since = self.chain, 0, time.perf_counter()
+        data: DepthFrame | PointCloud = frame
 
         def after(steps: range, _: Any) -> None:
             nonlocal since
             now = time.perf_counter()
-            self._count(" + ".join(self._names[position] for position in steps), now - since)
+            self._count(" + ".join(self._names[done + position] for position in steps), now - since)
             since = now
 
         with torch.no_grad(), guessing_planes(self._planes):
-            cloud: PointCloud = self.chain.run_in_passes(frame, generator=generator, after=after)
+            if self._fixed is not None:
+                if seen is None:
+                    self._since = since
+                    seen = self._fixed.look(frame)
+                begun = None if seen is None or seen.bounds is None else self._fixed.cloud(frame, seen.bounds)
+                if begun is not None:
+                    chain, data, since = self._rest, begun, self._since
+                    after(range(len(self._fixed.steps)), data)
+                    done = len(self._fixed.steps)
+            cloud: PointCloud = chain.run_in_passes(data, generator=generator, after=after)
         if self._warm_planes:
             self._planes = cloud.meta[0].get("planes", ())
         return cloud
@@ -269,6 +293,8 @@ class LivePipeline:
         with self._turn:
             self._stamps.reset()
             self._last, self._planes = None, ()
+            if self._fixed is not None:
+                self._fixed.forget()
             if self.before is not None:
                 self.before.reset()
 
@@ -285,6 +311,7 @@ class LivePipeline:
         passes = {name: histogram.summary() for name, histogram in self._passes.items()}
         whole = self._whole.summary()
         return LiveStats(
+            captured=self.captured,
             frames=self._number - self._counted_from,
             clouds=whole.count,
             faults=dict(self._faults),
@@ -293,6 +320,11 @@ class LivePipeline:
             resets=0 if self.before is None else self.before.resets,
             latency={"whole": whole, **passes},
         )
+
+    @property
+    def captured(self) -> tuple[str, ...]:
+        """The steps from the first on that a GPU repeats for each frame as one CUDA graph; those behind run as ever."""
+        return () if self._fixed is None else tuple(self._names[: len(self._fixed.steps)])
 
     def histogram(self) -> dict[str, list[float]]:
         """Return the latencies of whole frames: ``seconds``, the upper ends of the bins, and ``count`` of each."""

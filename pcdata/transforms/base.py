@@ -110,6 +110,15 @@ class Transform(nn.Module):
         """Do: pure given the params; never draws, never changes its input."""
         raise NotImplementedError(f"{type(self).__name__}: write the method transform(self, data, params)")
 
+    def fixed_work(self, like: Any) -> Callable[[Any], Any] | None:
+        """Prepare to run with fixed shapes on data like these, frame after frame; None = the step cannot.
+
+        What is returned takes a ``DepthFrame``, or the clouds of a step before as ``FixedRows`` (see
+        :mod:`pcdata.functional.fixed_rows`), and gives likewise. It sends nothing to the device and waits for nothing,
+        so a device can repeat what it started: values are looked at there alone.
+        """
+        return None
+
     def repeat(self, data: Any, decided: Decisions) -> Params:
         """Decide as the history tells, on the data that it is of or on others.
 

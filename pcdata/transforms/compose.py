@@ -167,6 +167,10 @@ class Compose(Transform):
             told(range(position - 1, position), data)
         return data
 
+    def steps_from(self, position: int) -> Compose:
+        """Return the steps from one on, for what those before it leave."""
+        return self._of(list(self.steps)[position:])
+
     @property
     def fields_read_once(self) -> Sequence[str]:
         """The fields of clouds that are read by one pass alone, before anybody looks at them: see :meth:`consume`."""

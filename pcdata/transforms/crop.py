@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, NonFiniteError, PcdataError, ShapeError
+from pcdata.functional.fixed_rows import FixedRows
 from pcdata.functional.rows import inside_box, ptr_after_mask, transform_points
 from pcdata.functional.selection import box_mask, polygon_mask
 from pcdata.geometry import rigid
@@ -82,6 +83,15 @@ class CropWorkspace(RemoveTransform):
         if isinstance(self.frame_from_box, str):
             boxes["frame_from_box"] = _pose(data, self.frame_from_box)
         return self._chosen(data, boxes)
+
+    def fixed_keep(self, like: FixedRows) -> Callable[[FixedRows], Tensor] | None:
+        """Mark what is inside one box that is aligned with the frame."""
+        if isinstance(self.lower, str) or isinstance(self.upper, str) or not self.is_plain:
+            return None
+        low, high = (
+            torch.tensor(corner, device=like.points.device, dtype=torch.float32) for corner in (self.lower, self.upper)
+        )
+        return lambda rows: ((rows.points >= low) & (rows.points <= high)).all(dim=1)
 
     def repeat(self, data: PointCloud, decided: Decisions) -> Params:
         """The boxes that the history tells."""

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import Annotated, Any
 
 import torch
 from torch import Tensor
 
+from pcdata.contracts.asked_later import is_set
 from pcdata.contracts.known import note
 from pcdata.contracts.on_host import on_host, uploaded
 from pcdata.errors import CaptureError, ConfigError
-from pcdata.functional.depth.deproject import Deprojected, deproject_images
+from pcdata.functional.depth.deproject import Deprojected, deproject_images, pixel_rays
+from pcdata.functional.fixed_rows import FixedRows, move_kept
+from pcdata.functional.rows import ptr_from_counts
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, METRE, Camera, DepthFrame, ImageLayout, Kind, PointCloud
 from pcdata.structures.image_layout import pixels_of_views
@@ -72,6 +75,12 @@ class MaskDepth(MaskTransform):
             mask = trusted if mask is None else mask & trusted
         return mask
 
+    def fixed_work(self, like: DepthFrame) -> Callable[[DepthFrame], DepthFrame] | None:
+        """Blank on the device; a limit to what goes, or labels that do, need the host."""
+        if self.max_drop is not None or self.drop_labels:
+            return None
+        return lambda frame: self.transform(frame, {})
+
 
 class Deproject(Transform):
     """Turn every depth reading into a point: one cloud per view, each in its own camera's frame.
@@ -95,6 +104,24 @@ class Deproject(Transform):
         """Deproject all views in one call."""
         own = deproject_images(data.depth, *self.cameras_of(data), data.colors, self.images_of(data))
         return self.cloud_of(data, own)
+
+    def fixed_work(self, like: DepthFrame) -> Callable[[DepthFrame], FixedRows]:
+        """Make a point of every pixel, and move those with a reading together."""
+        views, height, width = like.depth.shape
+        rays = pixel_rays(*self.cameras_of(like)[:1], (height, width), self.cameras_of(like)[1]).float().flatten(0, 2)
+        pixel = torch.arange(len(rays), dtype=torch.int64, device=like.device)
+        every = ptr_from_counts([height * width] * views, device=like.device)
+        viewpoint = torch.zeros(views, 3, dtype=torch.float32, device=like.device)
+
+        def work(frame: DepthFrame) -> FixedRows:
+            z = frame.depth.reshape(-1, 1)
+            has_reading = z[:, 0] > 0
+            points = torch.cat([rays * z, z], dim=1)
+            # No ray, or a point too far out: what is to be said of them is said elsewhere.
+            is_set((has_reading & ~points.isfinite().all(1)).any().reshape(1))
+            return FixedRows(*move_kept(points, pixel, every, has_reading), viewpoint, has_reading)
+
+        return work
 
     def cameras_of(self, data: DepthFrame) -> tuple[Tensor, Tensor | None]:
         """Return the intrinsics (V, 3, 3) and distortion (V, D) where the depth lies."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Interval, Le
@@ -99,3 +100,7 @@ class RemoveFlyingPixels(MaskTransform):
             if is_known(fact, data.depth):
                 note(fact, depth)
         return derived(data, depth=depth, confidence=confidence)
+
+    def fixed_work(self, like: DepthFrame) -> Callable[[DepthFrame], DepthFrame] | None:
+        """Blank on the device; a limit to what goes needs the host."""
+        return None if self.max_drop is not None else lambda frame: self.transform(frame, {})

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import Annotated, Any
 
 import torch
 from annotated_types import Ge
 from torch import Tensor
 
+from pcdata.contracts.asked_later import is_set
+from pcdata.contracts.dispatch import roomy_body
 from pcdata.contracts.on_host import bounds_of, counts_of
 from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
+from pcdata.functional.fixed_rows import FixedRows
 from pcdata.functional.rows import cloud_of_rows, group_first, ptr_after_mask, ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample, random_sample_index
 from pcdata.functional.voxels import find_voxel_size, voxel_downsample, voxel_nearest
@@ -221,6 +224,28 @@ class FarthestPointSample(_FarthestPoints):
     """
 
     start: Annotated[int, Ge(0)] = 0
+
+    def fixed_work(self, like: FixedRows) -> Callable[[FixedRows], FixedRows] | None:
+        """Sample by place alone, from the first row; a cloud that has too few is left to others."""
+        body = roomy_body("farthest_rows", like.points.device)
+        if body is None or self.color_weight or self.balance_labels or self.start or like.normals is not None:
+            return None
+        counts = [self.num_points] * (len(like.ptr) - 1)
+        picked_ptr = ptr_from_counts(counts, device=like.points.device)
+
+        def work(rows: FixedRows) -> FixedRows:
+            is_set((rows.ptr.diff() < self.num_points).any().reshape(1))
+            picks = body(rows.points, rows.ptr, counts).clamp_(max=len(rows.points) - 1)
+            return FixedRows(
+                rows.points[picks],
+                rows.source_index[picks],
+                picked_ptr,
+                rows.viewpoint,
+                picks,
+                counts=tuple(counts),
+            )
+
+        return work
 
     def starts(self, cloud: PointCloud, seeds: list[int]) -> dict[str, Any]:
         """Return the row, as far as the clouds have it."""

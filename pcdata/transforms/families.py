@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.errors import PcdataWarning, ReplayError, TooFewPointsError
+from pcdata.functional.fixed_rows import FixedRows, move_kept
 from pcdata.rng import Streams
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms.base import Params, Transform, sample_name
@@ -109,6 +110,22 @@ class DropLimit(Transform, abstract=True):
 
 class RemoveTransform(DropLimit, SelectTransform, abstract=True):
     """A step that removes rows: write ``pick``."""
+
+    def fixed_keep(self, like: FixedRows) -> Callable[[FixedRows], Tensor] | None:
+        """Return what marks the rows to keep as :meth:`fixed_work` does, (C,) bool; behind the last row anything."""
+        return None
+
+    def fixed_work(self, like: FixedRows) -> Callable[[FixedRows], FixedRows] | None:
+        """Mark, and move what is kept together."""
+        mark = self.fixed_keep(like)
+        if mark is None or like.normals is not None:
+            return None
+
+        def work(rows: FixedRows) -> FixedRows:
+            keep = mark(rows)
+            return FixedRows(*move_kept(rows.points, rows.source_index, rows.ptr, keep), rows.viewpoint, keep)
+
+        return work
 
 
 class MaskTransform(DropLimit, abstract=True):

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal
 
+from pcdata.contracts.dispatch import roomy_body
 from pcdata.contracts.known import FINITE, note
 from pcdata.errors import FrameError
+from pcdata.functional.fixed_rows import FixedRows
 from pcdata.functional.normals import estimate_normals, orient_normals
+from pcdata.functional.rows import cloud_of_rows
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.field_types import Count, Metres
@@ -28,6 +33,25 @@ class EstimateNormals(Transform):
     radius: Metres | None = 0.02
     max_neighbors: Count = 30
     orient: Literal["viewpoint", "none"] = "viewpoint"
+
+    def fixed_work(self, like: FixedRows) -> Callable[[FixedRows], FixedRows] | None:
+        """Estimate for clouds whose sizes are known."""
+        body = roomy_body("estimate_normals", like.points.device)
+        if body is None or like.counts is None:
+            return None
+        seen_from = like.viewpoint[cloud_of_rows(like.ptr)]
+
+        def work(rows: FixedRows) -> FixedRows:
+            normals = body(
+                points=rows.points, ptr=rows.ptr, radius=self.radius, max_neighbors=self.max_neighbors, grid=None
+            )
+            if self.orient == "viewpoint":
+                for values in (rows.points, normals, seen_from):
+                    note(FINITE, values)
+                normals = orient_normals(rows.points, normals, seen_from)
+            return replace(rows, normals=normals)
+
+        return work
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Estimate from the points of each cloud alone, and write the normals."""

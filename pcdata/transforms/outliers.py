@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import Annotated
+from collections.abc import Callable, Collection
+from typing import Annotated, Any
 
 from torch import Tensor
 
+from pcdata.contracts.dispatch import roomy_body
 from pcdata.contracts.host import negated
+from pcdata.functional.fixed_rows import FixedRows
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
 from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
@@ -42,6 +44,12 @@ class RemoveStatisticalOutliers(RemoveTransform):
         keep = negated(outlier)
         return keep, ptr_after_mask(keep, cloud.ptr)
 
+    def fixed_keep(self, like: FixedRows) -> Callable[[FixedRows], Tensor] | None:
+        """Mark the usual rows."""
+        return _kept(
+            "statistical_outlier_mask", like, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio, grid=None
+        )
+
 
 class RemoveRadiusOutliers(RemoveTransform):
     """Drop points with no more than ``min_neighbors`` points, themselves included, within a radius (Open3D's rule)."""
@@ -62,3 +70,13 @@ class RemoveRadiusOutliers(RemoveTransform):
         )
         keep = negated(outlier)
         return keep, ptr_after_mask(keep, cloud.ptr)
+
+    def fixed_keep(self, like: FixedRows) -> Callable[[FixedRows], Tensor] | None:
+        """Mark the rows with company."""
+        return _kept("radius_outlier_mask", like, min_neighbors=self.min_neighbors, radius=self.radius, grid=None)
+
+
+def _kept(name: str, like: FixedRows, **fields: Any) -> Callable[[FixedRows], Tensor] | None:
+    """Return what marks the rows that an operation does not."""
+    body = roomy_body(name, like.points.device)
+    return None if body is None else lambda rows: ~body(points=rows.points, ptr=rows.ptr, **fields)

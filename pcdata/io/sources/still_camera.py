@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import torch
 
+from pcdata.contracts.on_host import on_host
 from pcdata.errors import CaptureError
 from pcdata.structures import Camera, DepthFrame
 
@@ -44,9 +45,12 @@ def check_still_camera(where: str, frames: Sequence[DepthFrame]) -> None:
 
 def same_camera(one: Camera, other: Camera) -> bool:
     """Say whether two cameras have the same intrinsics and lens."""
-    if (one.distortion is None) != (other.distortion is None) or not torch.equal(one.intrinsics, other.intrinsics):
-        return False
-    return one.distortion is None or other.distortion is None or torch.equal(one.distortion, other.distortion)
+    pairs = (one.intrinsics, other.intrinsics), (one.distortion, other.distortion)
+    return all(
+        (mine is None and theirs is None)
+        or (mine is not None and theirs is not None and torch.equal(on_host(mine), on_host(theirs)))
+        for mine, theirs in pairs
+    )
 
 
 def _motion(one: torch.Tensor, other: torch.Tensor) -> tuple[float, float]:

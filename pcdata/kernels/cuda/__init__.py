@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pcdata.kernels.cuda import clusters as cuda_clusters
+from pcdata.kernels.cuda import compaction as cuda_compaction
 from pcdata.kernels.cuda import deprojection as cuda_deprojection
 from pcdata.kernels.cuda import depth_filters as cuda_depth_filters
 from pcdata.kernels.cuda import holes as cuda_holes
@@ -17,6 +18,7 @@ from pcdata.kernels.cuda.gpu import unavailable
 
 __all__ = [
     "cuda_clusters",
+    "cuda_compaction",
     "cuda_deprojection",
     "cuda_depth_filters",
     "cuda_holes",

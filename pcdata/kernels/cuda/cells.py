@@ -7,6 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from pcdata.contracts.asked_later import is_set
 from pcdata.functional.radius import cell_side, require_extent
 from pcdata.kernels.cuda.launching import Launcher
 
@@ -48,7 +49,7 @@ def cell_table(launcher: Launcher, points: Tensor, ptr: Tensor, radius: float, n
     )
     ends = counts.cumsum(0, dtype=torch.int32)
     placed = torch.empty((rows, 4), dtype=torch.float32, device=device)
-    launcher.launch("pc_place_points", rows, points, rows, needed, place_of, rank_of, counts, ends, placed)
+    launcher.launch("pc_place_points", rows, points, ptr, clouds, rows, needed, place_of, rank_of, counts, ends, placed)
     return CellTable(side, places, counts, ends, placed, place_of, listed, num_listed, far)
 
 
@@ -58,10 +59,10 @@ def num_places(rows: int) -> int:
 
 
 def hold_to_extent(where: str, points: Tensor, ptr: Tensor, radius: float, far: Tensor) -> None:
-    """Refuse clouds too large for their cells, as the reference does; the one wait for the device.
+    """Refuse clouds too large for their cells, as the reference does; the one wait for the device, if not put off.
 
     Raises:
         ConfigError: a cloud is more than 2^36 cells wide.
     """
-    if int(far):
+    if is_set(far):
         require_extent(where, points, ptr, radius)

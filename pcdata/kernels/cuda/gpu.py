@@ -10,6 +10,7 @@ import ctypes
 import functools
 import importlib
 import threading
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -17,7 +18,7 @@ from torch import Tensor
 
 from pcdata.kernels.cuda.compiling import compiled, cuda_core, supported_architectures, target_for, why_no_compiler
 from pcdata.kernels.cuda.declarations import KINDS, kernels
-from pcdata.kernels.cuda.launching import BLOCK, LAUNCHERS, Launcher
+from pcdata.kernels.cuda.launching import BLOCK, LAUNCHERS, Launcher, T
 
 _THREADS_PER_PROCESSOR = 2048  # at most resident, on every GPU since 2017 but small ones
 
@@ -54,6 +55,19 @@ class GpuLauncher(Launcher):
     def busy_threads(self) -> int:
         """Fill every processor once."""
         return self._processors * _THREADS_PER_PROCESSOR
+
+    def captured(self, work: Callable[[], T]) -> tuple[T, Callable[[], None]]:
+        """Capture a CUDA graph, after a run that compiles, loads and allocates what is missing."""
+        with torch.cuda.device(self.index):
+            here, aside = torch.cuda.current_stream(self.index), torch.cuda.Stream(self.index)
+            aside.wait_stream(here)
+            with torch.cuda.stream(aside):
+                work()
+            here.wait_stream(aside)
+            graph = torch.cuda.CUDAGraph()
+            with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # other threads may do as they like
+                result = work()
+        return result, graph.replay
 
     def _start(self, name: str, blocks: int, block: int, values: list[int | float]) -> None:
         handle = self._handle(name)

@@ -8,13 +8,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 from torch import Tensor
 
 from pcdata.kernels.cuda.declarations import kernels, values_of
 
 BLOCK = 256  # threads
+
+T = TypeVar("T")
 
 
 class Launcher(ABC):
@@ -39,6 +41,13 @@ class Launcher(ABC):
     @abstractmethod
     def busy_threads(self) -> int:
         """Return how many threads keep the device busy: for kernels that walk a list whose length it alone knows."""
+
+    @abstractmethod
+    def captured(self, work: Callable[[], T]) -> tuple[T, Callable[[], None]]:
+        """Take down work that waits for nothing and sends nothing; return its tensors, and what does it, into these.
+
+        Each time what was started is started with the same arguments: what work reads is to lie where it lay.
+        """
 
     @abstractmethod
     def _start(self, name: str, blocks: int, block: int, values: list[int | float]) -> None:

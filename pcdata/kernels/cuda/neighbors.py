@@ -84,7 +84,7 @@ def rows_within(
     return grown_within(search, points, ptr, radius, queries, queries_ptr, exclude_self)
 
 
-@kernel("estimate_normals", "cuda")
+@kernel("estimate_normals", "cuda", roomy=True)
 def estimate_normals(
     points: Tensor, ptr: Tensor, radius: float | None, max_neighbors: int, grid: ImageGrid | None
 ) -> Tensor:

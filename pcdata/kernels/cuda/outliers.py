@@ -19,7 +19,7 @@ _RUNS = 1024  # threads of a block, kRuns of the kernel
 _REACH = 32  # rows looked at on either side
 
 
-@kernel("radius_outlier_mask", "cuda")
+@kernel("radius_outlier_mask", "cuda", roomy=True)
 def radius_outlier_mask(
     points: Tensor, ptr: Tensor, min_neighbors: int, radius: float, grid: ImageGrid | None
 ) -> Tensor:
@@ -31,7 +31,7 @@ def radius_outlier_mask(
         )
         return fallen
     launcher = launcher_of(points)
-    outlier = torch.empty(rows, dtype=torch.bool, device=device)
+    outlier = torch.ones(rows, dtype=torch.bool, device=device)
     undecided = torch.empty(rows, dtype=torch.int32, device=device)
     count = torch.zeros(1, dtype=torch.int32, device=device)
     enough = min(min_neighbors, rows)  # as unreachable as any larger number
@@ -48,7 +48,7 @@ def radius_outlier_mask(
     return outlier
 
 
-@kernel("statistical_outlier_mask", "cuda")
+@kernel("statistical_outlier_mask", "cuda", roomy=True)
 def statistical_outlier_mask(
     points: Tensor, ptr: Tensor, num_neighbors: int, std_ratio: float, grid: ImageGrid | None
 ) -> Tensor:
@@ -60,6 +60,6 @@ def statistical_outlier_mask(
         return fallen
     launcher = launcher_of(points)
     mean = mean_distances(launcher, box_tree(launcher, points, ptr), k)
-    outlier = torch.empty(len(points), dtype=torch.bool, device=points.device)
+    outlier = torch.ones(len(points), dtype=torch.bool, device=points.device)
     launcher.launch_blocks("pc_mark_unusual", len(ptr) - 1, mean, ptr, float(std_ratio), outlier, block=_RUNS)
     return outlier

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from torch import Tensor
 
@@ -15,7 +17,7 @@ _LARGE = 1 << 15  # points a cloud, from which all blocks sample one together: m
 _WARP, _MOST_THREADS = 32, 1024
 
 
-@kernel("farthest_rows", "cuda")
+@kernel("farthest_rows", "cuda", roomy=True)
 def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
     """Pick in one kernel, or in one for each cloud where these are large; no pick waits for the host."""
     clouds, (rows, width), device = len(counts), points.shape, points.device
@@ -28,8 +30,8 @@ def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
     nearest = torch.empty(rows, dtype=torch.float32, device=device)
     each = rows // max(1, clouds)
     if each < _LARGE:
+        picks_ptr = _begins(tuple(counts), device)
         block = min(_MOST_THREADS, _WARP << max(0, (each - 1) // _WARP).bit_length())
-        picks_ptr = ptr_from_counts(counts, device=device)
         launcher.launch_blocks("pc_sample_clouds", clouds, points, ptr, width, picks_ptr, nearest, picks, block=block)
         return picks
     best = torch.zeros(sum(counts), dtype=torch.int64, device=device)
@@ -44,3 +46,9 @@ def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
         )
         begin += count
     return picks
+
+
+@functools.lru_cache(maxsize=8)
+def _begins(counts: tuple[int, ...], device: torch.device) -> Tensor:
+    """Return row pointers on the device, sent there once for calls that are alike."""
+    return ptr_from_counts(list(counts), device=device)

@@ -14,6 +14,7 @@ import os
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,7 @@ class Harness(launching.Launcher):
     def __init__(self, seed: int = 0) -> None:
         self.seeds = itertools.repeat(0) if seed == 0 else itertools.count(seed)
         self.started: list[str] = []
+        self.recordings: list[pretend_device.Recording] = []
 
     def resident_blocks(self, name: str, block: int = launching.BLOCK) -> int:
         return 3
@@ -70,6 +72,12 @@ class Harness(launching.Launcher):
         self.started.append(name)
         for watched in pretend_device._watching:
             watched.launches += 1
+        for recording in pretend_device._recordings:
+            told = f"{name} {blocks} x {block} {values}"
+            recording.add(told, lambda: self._run(name, blocks, block, values))
+        self._run(name, blocks, block, values)
+
+    def _run(self, name: str, blocks: int, block: int, values: list[int | float]) -> None:
         held = [ctypes.c_double(one) if isinstance(one, float) else ctypes.c_int64(one) for one in values]
         words = (ctypes.c_uint64 * len(held))(*(int.from_bytes(bytes(one), "little") for one in held))
         told = ctypes.create_string_buffer(400)
@@ -78,6 +86,13 @@ class Harness(launching.Launcher):
         count, room = ctypes.c_int64(len(words)), ctypes.c_int64(len(told))
         if library().pc_run_kernel(name.encode(), *numbers, words, count, seed, told, room):
             raise RuntimeError(told.value.decode())
+
+    def captured(self, work: Callable[[], Any]) -> tuple[Any, Callable[[], None]]:
+        """Take down what the pretended device is asked, with its memory."""
+        with pretend_device.recording() as recording:
+            result = work()
+        self.recordings.append(recording)
+        return result, recording.replay
 
     def launch(self, name: str, threads: int, *arguments: Any, block: int = launching.BLOCK) -> None:
         super().launch(name, threads, *map(on_host, arguments), block=block)
@@ -111,6 +126,8 @@ def register() -> None:
     for operation in [*dispatch.OPERATIONS.values(), *dispatch.INNER.values()]:
         if "cuda" in operation.kernels:
             operation.kernels[BACKEND] = operation.kernels["cuda"]
+        if "cuda" in operation.roomy:
+            operation.roomy.add(BACKEND)
     for device_type in ("cpu", pretend_device.NAME):
         launching.LAUNCHERS[device_type] = lambda tensor: harness
     dispatch.BACKEND_MODULES[BACKEND] = __name__

@@ -4,6 +4,7 @@
 #include "pc/gpu/box_tree.hpp"
 #include "pc/gpu/cell_table.hpp"
 #include "pc/gpu/clusters.hpp"
+#include "pc/gpu/compaction.hpp"
 #include "pc/gpu/deprojection.hpp"
 #include "pc/gpu/depth_filters.hpp"
 #include "pc/gpu/farthest.hpp"

@@ -22,12 +22,16 @@ PC_HD uint64_t morton_bits(float value, float low, float high, int64_t bits) {
   return static_cast<uint64_t>(part > 0 ? (part < most ? part : most) : 0);  // queries may lie outside
 }
 
-// Where rows come in the order: the cloud, then the Morton code in the box of all points. `box` is (2, 3); `bits` per
-// axis, 21 at most.
+// Where rows come in the order: the cloud, then the Morton code in the box of all points; last what no cloud fills.
+// `box` is (2, 3); `bits` per axis, 21 at most.
 PC_KERNEL(pc_morton_keys, const float* points, const int64_t* ptr, int64_t clouds, int64_t rows, const float* box,
           int64_t bits, int64_t* keys) {
   const int64_t row = thread_index();
   if (row >= rows) return;
+  if (row >= ptr[clouds]) {
+    keys[row] = 0x7FFFFFFFFFFFFFFF;
+    return;
+  }
   uint64_t at[3];
   for (int axis = 0; axis < 3; ++axis) at[axis] = morton_bits(points[3 * row + axis], box[axis], box[3 + axis], bits);
   const uint64_t code = math::morton_code(at[0] >> 11, at[1] >> 11, at[2] >> 11) << 33 |

@@ -49,7 +49,7 @@ PC_KERNEL(pc_insert_cells, const float* points, const int64_t* ptr, int64_t clou
           uint64_t* places, int64_t mask, const int32_t* needed, int32_t* place_of, int32_t* rank_of, int32_t* counts,
           int32_t* listed, int32_t* num_listed, int32_t* far) {
   const int64_t row = thread_index();
-  if (row >= rows || *needed == 0) return;
+  if (row >= filled(ptr, clouds, rows) || *needed == 0) return;
   const Cells cells{{points, ptr, clouds, side}, places, mask};
   const int64_t cloud = cloud_of(ptr, clouds, row);
   if (cells.grid.is_far(cloud, points + 3 * row)) *far = 1;
@@ -61,10 +61,10 @@ PC_KERNEL(pc_insert_cells, const float* points, const int64_t* ptr, int64_t clou
 }
 
 // Lay the points of each cell side by side: those of a place end where `ends`, the running total of counts, says.
-PC_KERNEL(pc_place_points, const float* points, int64_t rows, const int32_t* needed, const int32_t* place_of,
-          const int32_t* rank_of, const int32_t* counts, const int32_t* ends, float* placed) {
+PC_KERNEL(pc_place_points, const float* points, const int64_t* ptr, int64_t clouds, int64_t rows, const int32_t* needed,
+          const int32_t* place_of, const int32_t* rank_of, const int32_t* counts, const int32_t* ends, float* placed) {
   const int64_t row = thread_index();
-  if (row >= rows || *needed == 0) return;
+  if (row >= filled(ptr, clouds, rows) || *needed == 0) return;
   const int32_t place = place_of[row];
   const float* p = points + 3 * row;
   reinterpret_cast<Placed*>(placed)[ends[place] - counts[place] + rank_of[row]] = {p[0], p[1], p[2],

@@ -41,7 +41,10 @@ struct Sampling {
     }
     return best;
   }
-  PC_HD static int64_t row_of(uint64_t key) { return 0xFFFFFFFFu - static_cast<uint32_t>(key & 0xFFFFFFFFu); }
+  // The first row where none is left to be picked: a cloud that has fewer points than are asked of it.
+  PC_HD static int64_t row_of(uint64_t key) {
+    return key == 0 ? 0 : 0xFFFFFFFFu - static_cast<uint32_t>(key & 0xFFFFFFFFu);
+  }
 };
 
 // The greatest key of a block, in every thread. `table` has room for the warps of a block; two take turns.

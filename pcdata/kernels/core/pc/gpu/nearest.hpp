@@ -184,7 +184,7 @@ struct Queries {
   double limit;         // of squared distances, inclusive
   const float* limits;  // (Q), or null: the same for each query
 
-  PC_HD bool is_one() const { return thread_index() < count; }
+  PC_HD bool is_one() const { return thread_index() < filled(ptr, clouds, count); }
   PC_HD int64_t row() const { return order[thread_index()]; }
   PC_HD Query query() const {
     if (!is_one()) return {0, 0, 0, 0, 0, 0};

@@ -10,7 +10,7 @@ namespace pc::gpu {
 PC_KERNEL(pc_count_beside, const float* points, const int64_t* ptr, int64_t clouds, int64_t rows, double limit,
           int64_t enough, int64_t reach, uint8_t* outlier, int32_t* undecided, int32_t* count) {
   const int64_t row = thread_index();
-  if (row >= rows) return;
+  if (row >= filled(ptr, clouds, rows)) return;
   const float below = static_cast<float>(limit);
   const int64_t cloud = cloud_of(ptr, clouds, row), begin = ptr[cloud], end = ptr[cloud + 1];
   int64_t found = 0.0f < below ? 1 : 0;  // itself

@@ -1,4 +1,6 @@
-// Rows of ragged clouds: cloud b is rows ptr[b] to ptr[b+1].
+// Rows of ragged clouds: cloud b is rows ptr[b] to ptr[b+1]. Arrays may have room for more rows than the clouds fill,
+// so that their sizes are known where the number of rows is not: what lies behind the last row is finite and means
+// nothing.
 #pragma once
 
 #include "pc/gpu/thread.hpp"
@@ -23,6 +25,11 @@ PC_HD int64_t cloud_of(const int64_t* ptr, int64_t clouds, int64_t row) {
       high = middle;
   }
   return low;
+}
+
+// How many rows the clouds fill of those that arrays have room for.
+PC_HD int64_t filled(const int64_t* ptr, int64_t clouds, int64_t room) {
+  return ptr[clouds] < room ? ptr[clouds] : room;
 }
 
 PC_HD float squared_between(const float* points, int64_t a, int64_t b) {
