@@ -312,6 +312,35 @@ def test_runs_of_points_change_no_count(order, scale, machine):
         assert_records_equal(points, ptr, drawn, competes, distance, torch.tensor([0, 3, 0, 500, 10_000]))
 
 
+@pytest.mark.parametrize("order", ["image", "shuffled"])
+@pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1e-6, 0.0), (1e16, 0.0), (1.0, 3e4)])
+def test_many_planes_close_to_the_best_are_counted_as_the_reference_does(order, scale, offset, machine):
+    """Most of many planes are told from the best by offsets from it: of a rough table, a wall and points about."""
+    from pcdata.functional import planes
+
+    generator = seeded(4)
+    u, v = torch.meshgrid(torch.linspace(-0.6, 0.6, 240), torch.linspace(-0.4, 0.4, 160), indexing="ij")
+    table = torch.stack([u, v, 0.3 * u + 0.004 * torch.randn(u.shape, generator=generator)], -1).reshape(-1, 3)
+    table[::9] = 2 * torch.rand(table[::9].shape, generator=generator) - 1
+    table[6000:12000, 0] = 0.2 + 0.01 * torch.rand(6000, generator=generator)
+    points = (table + offset) * scale
+    if order == "shuffled":
+        points = points[torch.randperm(len(points), generator=generator)]
+    drawn = planes_through(points[draw_rows(len(points), 3, 150, generator)])
+    best = planes_through(points[None, torch.tensor([20_000, 20_150, 38_000])])
+    drawn[90:] = best + 0.002 * torch.randn(60, 4, generator=generator, dtype=torch.float64)
+    drawn[:, 3][90:] = -(drawn[90:, :3] * points[20_000].double()).sum(1)  # turned about one of its points
+    drawn = torch.cat([drawn, drawn[100:101]])[None].contiguous()  # equals do not compete with the first
+    competes, ptr = ~drawn[..., 0].isnan(), torch.tensor([0, len(points)])
+    competes[:, ::7] = False
+    runs = planes.bound_runs(points, ptr, backend="cpu")
+    for distance, floor in ((0.001 * scale, 0), (0.01 * scale, 0), (0.01 * scale, 20_000), (5 * scale, 0)):
+        rules = drawn, competes, distance, torch.tensor([floor])
+        case = order, scale, offset, distance, floor
+        expected = reference_of(case, planes.record_planes, points, ptr, (), *rules)
+        assert torch.equal(planes.record_planes(points, ptr, runs, *rules, backend="cpu"), expected)
+
+
 @pytest.mark.parametrize("probability", [0.2, 0.9, 1 - 1e-15])
 @pytest.mark.parametrize("not_drawn", [0, 1])
 def test_a_search_that_may_stop_equals_the_reference(probability, not_drawn, machine):

@@ -1,9 +1,7 @@
 // The search for a plane that stops once a better one is unlikely to be missed, on some of the points of large clouds.
 #include <cmath>
 
-#include "pc/memory.hpp"
-#include "pc/planes/plane_sums.hpp"
-#include "pc/threads.hpp"
+#include "pc/planes/scored_points.hpp"
 
 namespace pc::planes {
 namespace {
@@ -16,49 +14,19 @@ struct Chance {
   int64_t not_drawn;        // of the first planes
 };
 
-// The points of a cloud that planes are scored on: all, or one out of each of 2^bits stretches, as the reference says.
-class ScoredPoints {
- public:
-  ScoredPoints(const float* points, int64_t count, int64_t bits, ScratchFrame& scratch) {
-    const bool is_all = bits > 40 || count <= int64_t{1} << bits;
-    size_ = is_all ? count : int64_t{1} << bits;
-    num_blocks_ = (size_ + PointBlock::kSize - 1) / PointBlock::kSize;
-    blocks_ = scratch.take<PointBlock>(num_blocks_);
-    for (int64_t b = 0; b < num_blocks_; ++b) {
-      const int64_t begin = b * PointBlock::kSize, end = std::min(size_, begin + PointBlock::kSize);
-      if (is_all) {
-        blocks_[b].read(points, begin, end);
-        continue;
-      }
-      float some[3 * PointBlock::kSize];
-      for (int64_t i = begin; i < end; ++i) {
-        const int64_t first = i * count >> bits, after = (i + 1) * count >> bits;
-        const int64_t part = i * 2654435769 & 0xFFFFFFFF;
-        std::memcpy(some + 3 * (i - begin), points + 3 * (first + (part * (after - first) >> 32)), 3 * sizeof(float));
-      }
-      blocks_[b].read(some, 0, end - begin);
-    }
-  }
-
-  int64_t size() const { return size_; }
-
-  // Count the points near some planes, kTries at most.
-  void count(const pc_context& context, const Plane* planes, int64_t some, float distance, int64_t* counts) const {
-    const int64_t pieces = (num_blocks_ + kBlocks - 1) / kBlocks;
-    std::vector<int64_t> own(static_cast<size_t>(pieces * kTries), 0);
-    parallel_for(context, num_blocks_, kBlocks, [&](int64_t begin, int64_t end, int64_t) {
-      int64_t* to = own.data() + begin / kBlocks * kTries;
-      for (int64_t b = begin; b < end; ++b) count_near_all(blocks_[b], planes, some, distance, to);
-    });
-    std::fill_n(counts, some, 0);
-    for (int64_t piece = 0; piece < pieces; ++piece)
-      for (int64_t h = 0; h < some; ++h) counts[h] += own[static_cast<size_t>(piece * kTries + h)];
-  }
-
- private:
-  int64_t size_, num_blocks_;
-  PointBlock* blocks_;
-};
+// Count the points near some planes, kTries at most.
+void count_tries(const pc_context& context, const ScoredPoints& points, const Plane* planes, int64_t some,
+                 float distance, int64_t* counts) {
+  const int64_t pieces = (points.num_blocks() + kBlocks - 1) / kBlocks;
+  std::vector<int64_t> own(static_cast<size_t>(pieces * kTries), 0);
+  parallel_for(context, points.num_blocks(), kBlocks, [&](int64_t begin, int64_t end, int64_t) {
+    int64_t* to = own.data() + begin / kBlocks * kTries;
+    for (int64_t b = begin; b < end; ++b) count_near_all(points.block(b), planes, some, distance, to);
+  });
+  std::fill_n(counts, some, 0);
+  for (int64_t piece = 0; piece < pieces; ++piece)
+    for (int64_t h = 0; h < some; ++h) counts[h] += own[static_cast<size_t>(piece * kTries + h)];
+}
 
 void search(const pc_context& context, const ScoredPoints& points, const Plane* planes, const uint8_t* competes,
             int64_t num_planes, const Chance& chance, int64_t* counts) {
@@ -68,7 +36,7 @@ void search(const pc_context& context, const ScoredPoints& points, const Plane* 
   for (int64_t first = 0; first < num_planes; first += kTries) {
     int64_t found[kTries];
     const int64_t some = std::min(kTries, num_planes - first);
-    points.count(context, planes + first, some, static_cast<float>(chance.distance), found);
+    count_tries(context, points, planes + first, some, static_cast<float>(chance.distance), found);
     for (int64_t k = 0; k < some; ++k) {
       const int64_t at = first + k;
       if (competes[at] && found[k] > best) best = counts[at] = found[k];
