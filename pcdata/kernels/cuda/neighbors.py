@@ -18,6 +18,7 @@ from pcdata.functional.neighbors import Listed, grown_within
 from pcdata.functional.radius import largest_squared
 from pcdata.kernels.cuda.launching import Launcher, launcher_of
 from pcdata.kernels.cuda.trees import BoxTree, box_tree, in_order
+from pcdata.kernels.cuda.windows import organized, tile_tree
 
 _MOST_ROWS = 2**31 - 2  # rows have 32 bits in a key
 _FEW = (8, 16, 32, 64)  # neighbors that a thread keeps to itself
@@ -41,9 +42,12 @@ def nearest_rows(
     if points.shape[1] != 3 or max(k, len(points)) > _MOST_ROWS:
         fallen: tuple[Tensor, Tensor] = INNER["nearest_rows"].reference(points, ptr, k, **own, grid=grid)
         return fallen
-    launcher = launcher_of(points)
-    tree = box_tree(launcher, points.detach().contiguous(), ptr.contiguous())
-    return searched(launcher, tree, k, **own)
+    launcher, points, ptr = launcher_of(points), points.detach().contiguous(), ptr.contiguous()
+    if grid is None or queries is not None or isinstance(radius, Tensor):
+        return searched(launcher, box_tree(launcher, points, ptr), k, **own)
+    index, told = _room(points, k)
+    _find_own(launcher, "nearest", _FEW, points, ptr, k, radius, grid, len(points), index, told, 0)
+    return index, told
 
 
 @kernel("nearest_chunks", "cuda")
@@ -95,9 +99,8 @@ def estimate_normals(
         fallen: Tensor = reference(points, ptr, radius=radius, max_neighbors=max_neighbors, backend="cuda")
         return fallen
     launcher = launcher_of(points)
-    tree = box_tree(launcher, points, ptr)
     normals = torch.empty_like(points)
-    _start(launcher, "pc_normals", _FEW[2:], tree, k, tree.points, tree.ptr, tree.order, radius, normals)
+    _find_own(launcher, "normals", _FEW[2:], points, ptr, k, radius, grid, normals)
     return normals
 
 
@@ -106,10 +109,10 @@ def reachable(count: int, points: Tensor) -> int:
     return min(count, max(1, len(points)))
 
 
-def mean_distances(launcher: Launcher, tree: BoxTree, k: int) -> Tensor:
+def mean_distances(launcher: Launcher, points: Tensor, ptr: Tensor, k: int, grid: ImageGrid | None) -> Tensor:
     """Return (N,) float64: the mean distance of each point to its nearest ``k``, at most 64 of them."""
-    mean = torch.empty(len(tree.points), dtype=torch.float64, device=tree.points.device)
-    _start(launcher, "pc_mean_distances", _FEW[2:], tree, k, tree.points, tree.ptr, tree.order, None, mean)
+    mean = torch.empty(len(points), dtype=torch.float64, device=points.device)
+    _find_own(launcher, "mean_distances", _FEW[2:], points, ptr, k, None, grid, mean)
     return mean
 
 
@@ -124,17 +127,49 @@ def searched(
     squared: bool = False,
 ) -> tuple[Tensor, Tensor]:
     """Return rows (Q, k), and distances or their squares (Q, k)."""
-    order, device = tree.order, tree.points.device
+    order = tree.order
     if queries is None or queries_ptr is None:
         queries, queries_ptr = tree.points, tree.ptr
     else:
         queries, queries_ptr = queries.detach().contiguous(), queries_ptr.contiguous()
         order = in_order(launcher, queries, queries_ptr, tree.box)
-    index = torch.empty((len(queries), k), dtype=torch.int64, device=device)
-    told = torch.empty((len(queries), k), dtype=torch.float32, device=device)
+    index, told = _room(queries, k)
     results = len(tree.points), index, told, int(squared)
-    _start(launcher, "pc_nearest", _FEW, tree, k, queries, queries_ptr, order, radius, *results)
+    _start(launcher, "nearest", _FEW, tree, k, queries, queries_ptr, order, radius, *results)
     return index, told
+
+
+def _room(queries: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Return room for rows (Q, k), and for distances (Q, k)."""
+    size, device = (len(queries), k), queries.device
+    return torch.empty(size, dtype=torch.int64, device=device), torch.empty(size, dtype=torch.float32, device=device)
+
+
+def _find_own(
+    launcher: Launcher,
+    kind: str,
+    sizes: Sequence[int],
+    points: Tensor,
+    ptr: Tensor,
+    k: int,
+    radius: float | None,
+    grid: ImageGrid | None,
+    *results: Any,
+) -> None:
+    """Search what is near each of the points: in windows of their images, the rest in a tree."""
+    cloud = organized(launcher, points, ptr, grid) if k <= sizes[-1] else None
+    if cloud is None:
+        tree = box_tree(launcher, points, ptr)
+        _start(launcher, kind, sizes, tree, k, points, ptr, tree.order, radius, *results)
+        return
+    size, limit = _fewest(sizes, k), float(largest_squared(radius, torch.device("cpu")))
+    launcher.launch(f"pc_window_{kind}_{size}", len(points), *cloud.windows, k, limit, *results, block=_BLOCK)
+    tree = tile_tree(launcher, cloud)
+    _start(launcher, kind, sizes, tree, k, points, ptr, tree.order, radius, *results, some=cloud.num_rest)
+
+
+def _fewest(sizes: Sequence[int], k: int) -> int | str:
+    return next((size for size in sizes if k <= size), "many")
 
 
 def _start(
@@ -148,14 +183,15 @@ def _start(
     order: Tensor,
     radius: float | Tensor | None,
     *results: Any,
+    some: Tensor | None = None,
 ) -> None:
-    """Search with the kernel that keeps the fewest neighbors to itself, and enough."""
+    """Search with the kernel that keeps the fewest neighbors to itself, and enough; all queries or ``some`` (1,)."""
     of_each = isinstance(radius, Tensor)
     limits = largest_squared(radius, tree.points.device).contiguous() if of_each else None
     limit = float(largest_squared(None if isinstance(radius, Tensor) else radius, torch.device("cpu")))
     launcher.launch(
-        f"{kind}_{next((size for size in sizes if k <= size), 'many')}",
+        f"pc_{kind}_{_fewest(sizes, k)}",
         *(len(queries), queries, queries_ptr, order, tree.ptr, len(tree.ptr) - 1, len(queries), k, limit, limits),
-        *(tree.placed, len(tree.points), tree.sides, tree.least_rows, tree.nodes, *results),
+        *(some, tree.placed, len(tree.points), tree.sides, tree.least_rows, tree.nodes, *results),
         block=_BLOCK,
     )

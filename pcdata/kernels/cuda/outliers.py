@@ -8,11 +8,11 @@ from torch import Tensor
 import pcdata.functional.outliers  # noqa: F401 - the operation must be registered before its kernel
 from pcdata.contracts.dispatch import OPERATIONS, kernel
 from pcdata.functional.image_grid import ImageGrid
-from pcdata.functional.radius import squared_radius
+from pcdata.functional.radius import cell_side, squared_radius
 from pcdata.kernels.cuda.cells import MOST_ROWS, cell_table, hold_to_extent
-from pcdata.kernels.cuda.launching import launcher_of
+from pcdata.kernels.cuda.launching import Launcher, launcher_of
 from pcdata.kernels.cuda.neighbors import mean_distances, reachable
-from pcdata.kernels.cuda.trees import box_tree
+from pcdata.kernels.cuda.windows import Organized, organized, tile_tree
 
 _MOST_NEIGHBORS = 64  # that a thread keeps to itself
 _RUNS = 1024  # threads of a block, kRuns of the kernel
@@ -32,10 +32,14 @@ def radius_outlier_mask(
         return fallen
     launcher = launcher_of(points)
     outlier = torch.ones(rows, dtype=torch.bool, device=device)
-    undecided = torch.empty(rows, dtype=torch.int32, device=device)
-    count = torch.zeros(1, dtype=torch.int32, device=device)
     enough = min(min_neighbors, rows)  # as unreachable as any larger number
     limit = float(squared_radius(radius, torch.device("cpu")))
+    if (cloud := organized(launcher, points, ptr, grid)) is not None:
+        far = _count_on_images(launcher, cloud, limit, enough, cell_side(radius), outlier)
+        hold_to_extent("radius_outlier_mask", points, ptr, radius, far)
+        return outlier
+    undecided = torch.empty(rows, dtype=torch.int32, device=device)
+    count = torch.zeros(1, dtype=torch.int32, device=device)
     reach = min(enough, _REACH)
     launcher.launch("pc_count_beside", rows, points, ptr, clouds, rows, limit, enough, reach, outlier, undecided, count)
     table = cell_table(launcher, points, ptr, radius, count)
@@ -46,6 +50,19 @@ def radius_outlier_mask(
     )
     hold_to_extent("radius_outlier_mask", points, ptr, radius, table.far)
     return outlier
+
+
+def _count_on_images(
+    launcher: Launcher, cloud: Organized, limit: float, enough: int, side: float, outlier: Tensor
+) -> Tensor:
+    """Count in windows of pixels, then, for those without a proof, in a tree; say whether points are too far apart."""
+    far = torch.zeros(1, dtype=torch.int32, device=outlier.device)
+    launcher.launch("pc_count_in_windows", len(outlier), *cloud.windows, limit, enough, side, outlier, far)
+    tree, clouds = tile_tree(launcher, cloud), len(cloud.ptr) - 1
+    queries = len(outlier), cloud.points, cloud.ptr, cloud.rest, cloud.ptr, clouds, len(outlier), 1, limit, None
+    boxes = cloud.num_rest, tree.placed, len(outlier), tree.sides, tree.least_rows, tree.nodes
+    launcher.launch("pc_count_in_tree", *queries, *boxes, enough, outlier)
+    return far
 
 
 @kernel("statistical_outlier_mask", "cuda", roomy=True)
@@ -59,7 +76,7 @@ def statistical_outlier_mask(
         fallen: Tensor = reference(points, ptr, num_neighbors=num_neighbors, std_ratio=std_ratio, backend="cuda")
         return fallen
     launcher = launcher_of(points)
-    mean = mean_distances(launcher, box_tree(launcher, points, ptr), k)
+    mean = mean_distances(launcher, points, ptr, k, grid)
     outlier = torch.ones(len(points), dtype=torch.bool, device=points.device)
     launcher.launch_blocks("pc_mark_unusual", len(ptr) - 1, mean, ptr, float(std_ratio), outlier, block=_RUNS)
     return outlier

@@ -37,6 +37,12 @@ def box_tree(launcher: Launcher, points: Tensor, ptr: Tensor) -> BoxTree:
     order = in_order(launcher, points, ptr, box)
     placed = torch.empty((rows, 4), dtype=torch.float32, device=device)
     launcher.launch("pc_place_in_order", rows, points, order, rows, placed)
+    return BoxTree(points, ptr, box, order, placed, *boxes_over(launcher, placed))
+
+
+def boxes_over(launcher: Launcher, placed: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the sides of boxes over points in their order, and the lowest row in each."""
+    rows, device = len(placed), placed.device
     levels = [-(-rows // _FAN)]
     while levels[-1] > _FAN:
         levels.append(-(-levels[-1] // _FAN))
@@ -49,7 +55,7 @@ def box_tree(launcher: Launcher, points: Tensor, ptr: Tensor) -> BoxTree:
         first = below + lower
         launcher.launch("pc_box_parents", level, first, level, below, sides, least_rows, nodes)
         below = first
-    return BoxTree(points, ptr, box, order, placed, sides, least_rows)
+    return sides, least_rows
 
 
 def in_order(launcher: Launcher, points: Tensor, ptr: Tensor, box: Tensor) -> Tensor:

@@ -9,11 +9,12 @@ import torch
 from torch import Tensor
 
 from pcdata.functional.depth.confidence import filled_confidence
-from pcdata.functional.depth.deproject import deproject_images, deproject_into_box, mask_depth
+from pcdata.functional.depth.deproject import deproject_depth, deproject_images, deproject_into_box, mask_depth
 from pcdata.functional.depth.disparity import reciprocals, smoothed_images
 from pcdata.functional.depth.flying_pixels import without_flying_pixels
 from pcdata.functional.depth.holes import fill_rows, filled_images
 from pcdata.functional.depth.temporal import temporal_step
+from pcdata.functional.image_grid import ImageGrid
 from pcdata.rng import seeded
 
 Call = Callable[[str], Any]
@@ -31,6 +32,12 @@ def cameras(shape: tuple[int, int, int] = (2, 21, 30)) -> Tensor:
     views, height, width = shape
     one = [[[60.0 + v, 0.0, width / 2 - 0.3], [0.0, 58.5, height / 2 + 0.2 * v], [0.0, 0.0, 1.0]] for v in range(views)]
     return torch.tensor(one, dtype=torch.float64)
+
+
+def on_image() -> dict[str, Any]:
+    """A cloud that still lies on its images."""
+    points, ptr, pixel = deproject_depth(depth_images(), cameras())
+    return {"points": points, "ptr": ptr, "grid": ImageGrid(pixel, (21, 30), cameras())}
 
 
 def _box(backend: str) -> Any:
@@ -57,7 +64,7 @@ CALLS: dict[str, Call] = {
     "smoothed_images": lambda backend: smoothed_images(depth_images(), None, 0.5, 0.1, 1, backend=backend),
     "temporal_step": _over_time,
     "without_flying_pixels": lambda backend: without_flying_pixels(depth_images(), None, 0.02, 3, backend=backend),
-    "filled_images": lambda backend: filled_images(depth_images(), "farthest", 3, 1, backend=backend),
+    "filled_images": lambda backend: filled_images(depth_images(), "left", 3, 1, backend=backend),
     "fill_rows": lambda backend: fill_rows(depth_images(), 2, backend=backend),
     "filled_confidence": _filled_confidence,
 }

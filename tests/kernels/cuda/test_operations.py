@@ -11,7 +11,7 @@ from tests import pretend_device
 from tests.factories import assert_same
 from tests.functional.test_op_contract import EXAMPLES, call, clouds_of, packed
 from tests.kernels.cuda import harness
-from tests.kernels.cuda.inner_calls import CALLS
+from tests.kernels.cuda.inner_calls import CALLS, on_image
 
 pytestmark = pytest.mark.skipif(harness.unavailable() is not None, reason=str(harness.unavailable()))
 harness.register()
@@ -79,6 +79,14 @@ def test_every_kernel_is_run_by_some_operation():
     launcher = harness.use(0)
     for run in CALLS.values():
         run(harness.BACKEND)
+    for k in (8, 16, 32, 64):  # in windows
+        for operation, count in (
+            (F.knn, "k"),
+            (F.statistical_outlier_mask, "num_neighbors"),
+            (F.estimate_normals, "max_neighbors"),
+        ):
+            operation(**on_image(), **{count: k}, backend=harness.BACKEND)
+    F.radius_outlier_mask(**on_image(), backend=harness.BACKEND)
     F.knn(torch.rand(1100, 3), k=1, backend=harness.BACKEND)  # parents of leaves
     F.statistical_outlier_mask(torch.rand(90, 3), num_neighbors=40, backend=harness.BACKEND)
     F.estimate_normals(torch.rand(90, 3), max_neighbors=40, backend=harness.BACKEND)

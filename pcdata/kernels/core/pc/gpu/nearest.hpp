@@ -183,8 +183,9 @@ struct Queries {
   int64_t k;
   double limit;         // of squared distances, inclusive
   const float* limits;  // (Q), or null: the same for each query
+  const int32_t* some;  // (1,), so many of them, or null: all
 
-  PC_HD bool is_one() const { return thread_index() < filled(ptr, clouds, count); }
+  PC_HD bool is_one() const { return thread_index() < (some == nullptr ? filled(ptr, clouds, count) : *some); }
   PC_HD int64_t row() const { return order[thread_index()]; }
   PC_HD Query query() const {
     if (!is_one()) return {0, 0, 0, 0, 0, 0};
@@ -279,14 +280,14 @@ PC_HD void find_few(const Tree& tree, const Queries& queries, const Tell& tell) 
   find(tree, queries, keys, tell);
 }
 
-#define PC_SEARCH_PARAMETERS                                                                                          \
-  const float *queries, const int64_t *query_ptr, const int64_t *query_order, const int64_t *ptr, int64_t clouds,     \
-      int64_t count, int64_t k, double limit, const float *limits, const float *placed, int64_t points, float *sides, \
-      int32_t *least_rows, int64_t nodes
-#define PC_SEARCH                                                                             \
-  const Queries asked{queries, query_ptr, query_order, count, clouds, ptr, k, limit, limits}; \
-  const Tree tree {                                                                           \
-    reinterpret_cast<const Placed*>(placed), points, { sides, least_rows, nodes }             \
+#define PC_SEARCH_PARAMETERS                                                                                      \
+  const float *queries, const int64_t *query_ptr, const int64_t *query_order, const int64_t *ptr, int64_t clouds, \
+      int64_t count, int64_t k, double limit, const float *limits, const int32_t *some, const float *placed,      \
+      int64_t points, float *sides, int32_t *least_rows, int64_t nodes
+#define PC_SEARCH                                                                                   \
+  const Queries asked{queries, query_ptr, query_order, count, clouds, ptr, k, limit, limits, some}; \
+  const Tree tree {                                                                                 \
+    reinterpret_cast<const Placed*>(placed), points, { sides, least_rows, nodes }                   \
   }
 
 // Neighbors, for up to so many of them.

@@ -5,6 +5,7 @@
 #include <atomic>
 #include <cmath>
 
+#include "pc/math/half_space.hpp"
 #include "pc/math/morton.hpp"
 #include "pc/memory.hpp"
 #include "pc/neighbors/leaves.hpp"
@@ -72,10 +73,9 @@ struct HalfSpaces {
 
  private:
   static void set(float slope, float& a, float& b) {
-    const double length = std::sqrt(1.0 + double{slope} * slope);
-    const bool nothing = slope == kInfinity || slope == -kInfinity;
-    a = nothing ? 0.0f : static_cast<float>(1.0 / length);
-    b = nothing ? slope : static_cast<float>(slope / length);
+    const math::HalfSpace side = math::HalfSpace::of(slope);
+    a = side.a;
+    b = side.b;
   }
 };
 
@@ -137,7 +137,6 @@ class OrganizedCloud {
   static constexpr int64_t kTile = 64, kLeafSide = 4;
   static constexpr int64_t kRowsPerPiece = 16;
   static constexpr int64_t kLinesPerPiece = 64;
-  static constexpr float kMinDepth = 1e-30f, kMaxSlope = 1e18f;  // so that no slope overflows
 
   // A leaf may reach over the edge of the image, into the margin.
   void fill_leaf_at(int64_t u, int64_t v, Leaf& leaf) const {
@@ -259,7 +258,8 @@ class OrganizedCloud {
       camera_.move(x, y, z);
       const FloatPack inverse = FloatPack(1.0f) / z, across = x * inverse, down = y * inverse;
       // Every comparison is false for NaN, which so counts as bad.
-      bad |= real & ~(less(FloatPack(kMinDepth), z) & less(z, FloatPack(kInfinity)) & within(across) & within(down));
+      bad |= real &
+             ~(less(FloatPack(math::kLeastDepth), z) & less(z, FloatPack(kInfinity)) & within(across) & within(down));
       minimum(across, FloatPack::load(least + u)).store(least + u);
       maximum(across, FloatPack::load(most + u)).store(most + u);
       low = minimum(down, low);
@@ -270,7 +270,7 @@ class OrganizedCloud {
     return bad == 0;
   }
   static PackMask within(const FloatPack& slope) {
-    return less(slope, FloatPack(kMaxSlope)) & less(FloatPack(-kMaxSlope), slope);
+    return less(slope, FloatPack(math::kMostSlope)) & less(FloatPack(-math::kMostSlope), slope);
   }
 
   int64_t first_row_ = 0, first_column_ = 0, width_ = 0, height_ = 0, stride_ = 0, origin_ = 0;
