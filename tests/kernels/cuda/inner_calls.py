@@ -14,6 +14,7 @@ from pcdata.functional.depth.disparity import reciprocals, smoothed_images
 from pcdata.functional.depth.flying_pixels import without_flying_pixels
 from pcdata.functional.depth.holes import fill_rows, filled_images
 from pcdata.functional.depth.temporal import temporal_step
+from pcdata.functional.fixed_rows import move_kept
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.rng import seeded
 
@@ -56,10 +57,16 @@ def _filled_confidence(backend: str) -> Any:
     return filled_confidence(before, torch.where(before > 0, before, 0.5), None, None, backend=backend)
 
 
+def _move_kept(backend: str) -> Any:
+    points, ptr, keep = torch.rand((50, 3), generator=seeded(1)), torch.tensor([0, 20, 40]), torch.arange(50) % 3 == 0
+    return move_kept(points, torch.arange(50), ptr, keep, backend=backend)
+
+
 CALLS: dict[str, Call] = {
     "mask_depth": lambda backend: mask_depth(depth_images(), 0.6, 1.2, None, backend=backend),
     "deproject_images": lambda backend: deproject_images(depth_images(), cameras(), None, None, {}, backend=backend),
     "deproject_into_box": _box,
+    "move_kept": _move_kept,
     "reciprocals": lambda backend: reciprocals(depth_images(), torch.tensor([20.0, 30.0]), backend=backend),
     "smoothed_images": lambda backend: smoothed_images(depth_images(), None, 0.5, 0.1, 1, backend=backend),
     "temporal_step": _over_time,
