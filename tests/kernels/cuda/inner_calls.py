@@ -16,6 +16,8 @@ from pcdata.functional.depth.holes import fill_rows, filled_images
 from pcdata.functional.depth.temporal import temporal_step
 from pcdata.functional.fixed_rows import move_kept
 from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.noise import move_points
+from pcdata.functional.rows import inside_box, transform_directions
 from pcdata.rng import seeded
 
 Call = Callable[[str], Any]
@@ -62,11 +64,20 @@ def _move_kept(backend: str) -> Any:
     return move_kept(points, torch.arange(50), ptr, keep, backend=backend)
 
 
+def _augmented(backend: str) -> Any:
+    points, ptr = torch.randn((70, 3), generator=seeded(1)), torch.tensor([0, 0, 70])
+    matrix, seeds = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1), torch.tensor([5, 6])
+    moved = move_points(points, ptr, [matrix, (seeds, 0.01, None)], backend=backend)
+    turned = transform_directions(points, ptr, matrix, backend=backend)
+    return moved, turned, inside_box(moved, (-1, -1, -1), (1, 1, 1), backend=backend)
+
+
 CALLS: dict[str, Call] = {
     "mask_depth": lambda backend: mask_depth(depth_images(), 0.6, 1.2, None, backend=backend),
     "deproject_images": lambda backend: deproject_images(depth_images(), cameras(), None, None, {}, backend=backend),
     "deproject_into_box": _box,
     "move_kept": _move_kept,
+    "move_points": _augmented,
     "reciprocals": lambda backend: reciprocals(depth_images(), torch.tensor([20.0, 30.0]), backend=backend),
     "smoothed_images": lambda backend: smoothed_images(depth_images(), None, 0.5, 0.1, 1, backend=backend),
     "temporal_step": _over_time,

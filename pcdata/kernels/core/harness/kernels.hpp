@@ -9,6 +9,7 @@
 #include "pc/gpu/depth_filters.hpp"
 #include "pc/gpu/farthest.hpp"
 #include "pc/gpu/holes.hpp"
+#include "pc/gpu/motions.hpp"
 #include "pc/gpu/nearest.hpp"
 #include "pc/gpu/organized.hpp"
 #include "pc/gpu/planes.hpp"

@@ -33,6 +33,16 @@ PC_HD float float_of_bits(uint32_t bits) {
 #endif
 }
 
+PC_HD uint32_t bits_of_float(float value) {
+#if defined(__CUDACC__)
+  return __float_as_uint(value);
+#else
+  uint32_t bits;
+  __builtin_memcpy(&bits, &value, sizeof bits);
+  return bits;
+#endif
+}
+
 PC_HD double larger(double a, double b) { return a > b ? a : b; }
 
 }  // namespace pc::math
