@@ -362,11 +362,15 @@ def _draw_triples(counts: list[int], num_hypotheses: int, seeds: list[int]) -> t
 def draw_rows(num_points: int, size: int, count: int, generator: torch.Generator) -> Tensor:
     """Draw (count, size) rows of a cloud, distinct within each draw and uniform: each skips over those before it."""
     drawn: list[Tensor] = []
+    rising: list[Tensor] = []  # the same in order
     for taken in range(size):
         row = torch.randint(num_points - taken, (count,), generator=generator, device="cpu")
-        for before in torch.stack(drawn).sort(0).values if drawn else ():
+        for before in rising:
             row += row >= before
         drawn.append(row)
+        for place, other in enumerate(rising):
+            rising[place], row = torch.minimum(other, row), torch.maximum(other, row)
+        rising.append(row)
     return torch.stack(drawn, dim=1)
 
 

@@ -137,7 +137,8 @@ class ClusterObjects(DropLimit):
             listed = [(b, label, area) for b, (*_, areas) in enumerate(parts) for label, area in enumerate(areas)]
             found_params["areas"] = torch.tensor(listed, dtype=torch.float64, device="cpu").reshape(-1, 3)
         evidence = evidence_params(separations, before, [labels for labels, *_ in parts]) if self.split_touching else {}
-        return {"labels": torch.cat([labels for labels, *_ in parts]), **found_params, **evidence}
+        labels = parts[0][0] if len(parts) == 1 else torch.cat([labels for labels, *_ in parts])
+        return {"labels": labels, **found_params, **evidence}
 
     def _clusters(self, data: PointCloud, grid: ImageGrid | None) -> Tensor:
         """Return the cluster (N,) of every point, -1 = noise."""
@@ -154,9 +155,14 @@ class ClusterObjects(DropLimit):
         reach = 2 if lined else 1
         return image_clusters(data.points, data.ptr, pixel_index=pixel, size=size, eps=self.eps, reach=reach)
 
-    def _sizes(self, data: PointCloud, b: int, raw: Tensor, grid: ImageGrid | None) -> tuple[Tensor, Tensor]:
-        """Return points and area (K,) of every cluster of cloud ``b``; no areas where none is asked for."""
-        size = torch.bincount(raw + 1, minlength=1)[1:]
+    def _sizes(
+        self, data: PointCloud, b: int, raw: Tensor, grid: ImageGrid | None, place: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Return points and area (K,) of every cluster of cloud ``b``; no areas where none is asked for.
+
+        ``place`` is one more than ``raw``, if that is at hand.
+        """
+        size = torch.bincount(raw + 1 if place is None else place, minlength=1)[1:]
         if self.min_area is None and self.max_area is None:
             return size, torch.zeros_like(size, dtype=torch.float64)
         points = data.points[int(data.ptr[b]) : int(data.ptr[b + 1])]
@@ -204,7 +210,8 @@ class ClusterObjects(DropLimit):
         The second result are the points of noise and of clusters that are too small and too large, the third the areas
         of the objects.
         """
-        size, area = self._sizes(data, b, raw, grid)
+        place = raw + 1  # of noise and clusters in a list of both
+        size, area = self._sizes(data, b, raw, grid, place)
         small = ~self._large_enough(size, area)
         many, wide = size > self._counts()[1], area > (self.max_area or math.inf)
         large = (many | wide) & ~small
@@ -212,8 +219,8 @@ class ClusterObjects(DropLimit):
             self._warn_of_large(data, b, size[large & many], area[large & wide])
         accepted = torch.nn.functional.pad(~small & ~large, (1, 0))  # noise first
         number = torch.where(accepted, accepted.cumsum(0) - 1, -1)
-        counted = [int((raw < 0).sum()), int(size[small].sum()), int(size[large].sum())]
-        return number[raw + 1], counted, area[~small & ~large].tolist()
+        counted = [len(raw) - int(size.sum()), int(size[small].sum()), int(size[large].sum())]
+        return number.index_select(0, place), counted, area[~small & ~large].tolist()
 
     def _warn_of_large(self, data: PointCloud, b: int, size: Tensor, area: Tensor) -> None:
         """Say that what may be wanted is left out."""

@@ -164,6 +164,22 @@ def test_many_farthest_points_of_a_large_cloud_equal_the_reference():
     assert_equal_to_reference(farthest_point_sample, points, num_samples=2000)
 
 
+@pytest.mark.parametrize("order", ["image", "holes", "strays", "repeated", "shuffled"])
+def test_pixels_side_by_side_are_sampled_as_any_points_are(order, machine):
+    """Pieces of rows of an image are sorted as one, but for those over an edge; the last is no whole piece."""
+    points, generator = organized(100, 155)[:-3], seeded(3)
+    points[5000:9000] += 0.4  # an edge
+    if order == "holes":
+        points = points[torch.rand(len(points), generator=generator) < 0.8]
+    elif order == "strays":
+        points[::701] *= 1e4
+    elif order == "repeated":
+        points[2000:14_000] = points[2000]
+    elif order == "shuffled":
+        points = points[torch.randperm(len(points), generator=generator)]
+    assert_equal_to_reference(farthest_point_sample, points, num_samples=150, case=(order, "pixels"))
+
+
 def test_a_dense_spot_far_from_the_rest_is_sampled_exactly():
     # Every level of the spatial sort sees two clusters: the recursion is as deep as float32 allows.
     points = torch.cat([random(400, 3, seed=k) * 2.0**-k for k in range(0, 100, 4)])

@@ -1,5 +1,5 @@
 // Farthest point sampling of ragged batches.
-#include "pc/sampling/farthest.hpp"
+#include "pc/sampling/groups.hpp"
 
 namespace pc::sampling {
 namespace {
@@ -24,10 +24,13 @@ void start(Task& task, sort::MortonPoints& order) {
   sampler.start_levels();
 }
 
-void start_in_parallel(const pc_context& context, ScratchFrame& scratch, FarthestSampler& sampler,
-                       sort::MortonPoints& order) {
-  order.parallel(context, scratch, sampler.points(), sampler.count(),
-                 [&](const sort::PlacedPoint* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
+void start_in_parallel(const pc_context& context, ScratchFrame& scratch, FarthestSampler& sampler) {
+  if (!PointGroups(context, scratch, sampler).place()) {
+    sort::MortonPoints order(scratch, sampler.count());
+    order.parallel(
+        context, scratch, sampler.points(), sampler.count(),
+        [&](const sort::PlacedPoint* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
+  }
   parallel_for(context, sampler.num_leaf_groups(), kGroupsPerPiece,
                [&](int64_t begin, int64_t end, int64_t) { sampler.start_leaf_groups(begin, end); });
   sampler.start_levels();
@@ -44,12 +47,13 @@ void sample(const pc_context& context, const float* points, const int64_t* ptr, 
     open.push_back({FarthestSampler(scratch, points + 3 * ptr[cloud], count), room, picks, wanted[cloud], 0});
     room += count;
   }
-  sort::MortonPoints order(scratch, room);
-  if (open.size() == 1)
-    start_in_parallel(context, scratch, open[0].sampler, order);
-  else
+  if (open.size() == 1) {
+    start_in_parallel(context, scratch, open[0].sampler);
+  } else {
+    sort::MortonPoints order(scratch, room);
     parallel_for(context, static_cast<int64_t>(open.size()), 1,
                  [&](int64_t i, int64_t, int64_t) { start(open[static_cast<size_t>(i)], order); });
+  }
   while (!open.empty()) {
     parallel_for(context, static_cast<int64_t>(open.size()), 1, [&](int64_t i, int64_t, int64_t) {
       Task& task = open[static_cast<size_t>(i)];

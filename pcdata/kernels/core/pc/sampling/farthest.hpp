@@ -55,6 +55,19 @@ class FarthestSampler {
     }
   }
 
+  // Put points of the cloud that follow each other at a place, all in one leaf.
+  void place_rows(int64_t first, int64_t count, int64_t at) {
+    Leaf& leaf = leaves_[at / kLeaf];
+    const int64_t to = at % kLeaf;
+    const float* from = points_ + 3 * first;
+    for (int64_t i = 0; i < count; ++i) {
+      leaf.x[to + i] = from[3 * i];
+      leaf.y[to + i] = from[3 * i + 1];
+      leaf.z[to + i] = from[3 * i + 2];
+      leaf.row[to + i] = static_cast<uint32_t>(first + i);
+    }
+  }
+
   // Once all points are placed: measure the leaves of some groups and take row 0 as the first pick. Groups are
   // independent of one another.
   void start_leaf_groups(int64_t begin, int64_t end) {
@@ -225,13 +238,14 @@ class FarthestSampler {
     }
     const float* axes[3] = {leaf.x, leaf.y, leaf.z};
     for (int axis = 0; axis < 3; ++axis) {
-      float low = axes[axis][0], high = low;
-      for (int i = 1; i < kLeaf; ++i) {
-        low = std::min(low, axes[axis][i]);
-        high = std::max(high, axes[axis][i]);
+      auto low = load<FloatRegister>(axes[axis]), high = low;
+      for (int i = kLanes; i < kLeaf; i += kLanes) {
+        const auto some = load<FloatRegister>(axes[axis] + i);
+        low = minimum(low, some);
+        high = maximum(high, some);
       }
-      group.low[axis][child] = low;
-      group.high[axis][child] = high;
+      group.low[axis][child] = lowest_lane<float>(low);
+      group.high[axis][child] = highest_lane<float>(high);
     }
     group.set_key(child, leaf.update(first));
   }

@@ -1,0 +1,137 @@
+// Leaves for farthest point sampling from points that follow each other in space as they do in memory.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "pc/sampling/farthest.hpp"
+
+namespace pc::sampling {
+
+// On a depth image, points side by side in memory are pixels side by side. Of such a cloud eight at a time are sorted
+// as one, by the middle of their box. Groups much wider than most, as those over an edge are, would spoil the boxes of
+// their leaves: their points are sorted one by one. Any order gives the same picks; this one takes a third of the time.
+class PointGroups {
+ public:
+  PointGroups(const pc_context& context, ScratchFrame& scratch, FarthestSampler& sampler)
+      : context_(context), scratch_(scratch), sampler_(sampler), count_(sampler.count() / kGroup) {}
+
+  // Place all points; false, and nothing is done, where the order of the points says too little of where they lie.
+  bool place() {
+    if (sampler_.count() < kFewPoints || !(find_widest() >= 0)) return false;
+    measure();
+    sort_out();
+    if (static_cast<int64_t>(loose_.size()) > sampler_.count() / 4) return false;
+    sort::MortonPoints order(scratch_, std::max<int64_t>(num_narrow_, static_cast<int64_t>(loose_.size())));
+    order.parallel(context_, scratch_, middle_, num_narrow_,
+                   [&](const sort::PlacedPoint* groups, int64_t count, int64_t at) {
+                     for (int64_t i = 0; i < count; ++i)
+                       sampler_.place_rows(kGroup * narrow_[groups[i].row()], kGroup, kGroup * (at + i));
+                   });
+    if (loose_.empty()) return true;
+    auto* points = scratch_.take<float>(3 * static_cast<int64_t>(loose_.size()));
+    for (size_t i = 0; i < loose_.size(); ++i) std::copy_n(sampler_.points() + 3 * loose_[i], 3, points + 3 * i);
+    order.serial(points, static_cast<int64_t>(loose_.size()), 0,
+                 [&](const sort::PlacedPoint* some, int64_t count, int64_t at) {
+                   for (int64_t i = 0; i < count; ++i)
+                     sampler_.place_rows(loose_[some[i].row()], 1, kGroup * num_narrow_ + at + i);
+                 });
+    return true;
+  }
+
+ private:
+  static constexpr int64_t kGroup = 8;
+  static constexpr int64_t kFewPoints = 1 << 13;  // the usual order takes no longer
+  static constexpr int64_t kLooked = 256;         // groups that tell of all
+
+  // Middle and half the longest side of a group's box.
+  struct Extent {
+    float middle[3], half;
+  };
+
+  Extent extent(int64_t group) const {
+    const float* p = sampler_.points() + 3 * kGroup * group;
+    Extent found{{0, 0, 0}, 0};
+    for (int axis = 0; axis < 3; ++axis) {
+      float low = p[axis], high = low;
+      for (int i = 1; i < kGroup; ++i) {
+        low = std::min(low, p[3 * i + axis]);
+        high = std::max(high, p[3 * i + axis]);
+      }
+      found.middle[axis] = 0.5F * low + 0.5F * high;
+      found.half = std::max(found.half, 0.5F * high - 0.5F * low);
+    }
+    return found;
+  }
+
+  static float median(std::vector<float>& numbers) {
+    const auto middle = numbers.begin() + static_cast<int64_t>(numbers.size() / 2);
+    std::nth_element(numbers.begin(), middle, numbers.end());
+    return *middle;
+  }
+
+  // How wide a group may be, or -1 where groups are no pieces of a surface: a row of pixels is some 16 / sqrt(n) as
+  // wide as most of the cloud.
+  float find_widest() {
+    constexpr float kMostOfCloud = 48, kMostOfUsual = 3;
+    std::vector<float> half, at[3], off;
+    for (int64_t i = 0; i < kLooked; ++i) {
+      const Extent own = extent(i * count_ / kLooked);
+      half.push_back(own.half);
+      for (int axis = 0; axis < 3; ++axis) at[axis].push_back(own.middle[axis]);
+    }
+    float spread = 0;
+    for (auto& along : at) {
+      std::vector<float> sorted = along;
+      const float center = median(sorted);
+      off.clear();
+      for (const float one : along) off.push_back(std::fabs(one - center));
+      spread = std::max(spread, median(off));
+    }
+    const float usual = median(half), most = kMostOfCloud * spread / std::sqrt(static_cast<float>(sampler_.count()));
+    widest_ = usual <= most ? kMostOfUsual * usual : -1;
+    return widest_;
+  }
+
+  void measure() {
+    middle_ = scratch_.take<float>(3 * count_);
+    half_ = scratch_.take<float>(count_);
+    parallel_for(context_, count_, 2048, [&](int64_t begin, int64_t end, int64_t) {
+      for (int64_t group = begin; group < end; ++group) {
+        const Extent own = extent(group);
+        std::copy_n(own.middle, 3, middle_ + 3 * group);
+        half_[group] = own.half;
+      }
+    });
+  }
+
+  // Move the middles of narrow groups together, and list the points of all others.
+  void sort_out() {
+    narrow_ = scratch_.take<uint32_t>(count_);
+    const auto loosen = [&](int64_t begin, int64_t end) {
+      for (int64_t row = begin; row < end; ++row) loose_.push_back(static_cast<uint32_t>(row));
+    };
+    for (int64_t group = 0; group < count_; ++group) {
+      if (!(half_[group] <= widest_)) {
+        loosen(kGroup * group, kGroup * (group + 1));
+        continue;
+      }
+      std::copy_n(middle_ + 3 * group, 3, middle_ + 3 * num_narrow_);
+      narrow_[num_narrow_++] = static_cast<uint32_t>(group);
+    }
+    loosen(kGroup * count_, sampler_.count());
+  }
+
+  const pc_context& context_;
+  ScratchFrame& scratch_;
+  FarthestSampler& sampler_;
+  int64_t count_;
+  float widest_ = -1;
+  float *middle_ = nullptr, *half_ = nullptr;
+  uint32_t* narrow_ = nullptr;  // groups
+  int64_t num_narrow_ = 0;
+  std::vector<uint32_t> loose_;  // rows
+};
+
+}  // namespace pc::sampling
