@@ -24,6 +24,7 @@ class FixedRows:
     viewpoint: Tensor  # (B, 3) where each cloud's sensor stood
     chosen: Tensor  # (C,) bool or int64 rows: which rows of those before the step these are
     normals: Tensor | None = None  # (C, 3)
+    told: Tensor | None = None  # (B, K) float64: what the host is to be told beside the number of rows
     counts: tuple[int, ...] | None = None  # rows of each cloud, where the host knows them: then there is no more room
 
 

@@ -28,7 +28,7 @@ _PLANES, _POINTS = 64, 4096
 # Hypotheses of the first look where few may do; as many again as there were after each.
 _FIRST_TRIES = 64
 # Points that hypotheses are scored on where they need not be the best of all: their shares are off by 0.4 % or less.
-_SCORED_BITS, _ALL_BITS = 14, 62
+SCORED_BITS, _ALL_BITS = 14, 62
 # Planes drawn at a time, over all clouds: 32 MB.
 _MOST_HYPOTHESES = 1 << 20
 
@@ -341,14 +341,14 @@ def ransac_plane(
             near = record_planes(own, own_ptr, runs, hypotheses, competes, distance, floors, backend=backend)
         else:
             search = distance, probability, hypotheses.shape[1] - num_hypotheses
-            near = search_planes(own, own_ptr, hypotheses, competes, *search, _SCORED_BITS, backend=backend)
+            near = search_planes(own, own_ptr, hypotheses, competes, *search, SCORED_BITS, backend=backend)
             for b in (near.amax(1) < 3).nonzero().squeeze(1).tolist():
                 alone = *_clouds_between(own, own_ptr, b, b + 1), hypotheses[b : b + 1], competes[b : b + 1]
                 near[b] = search_planes(*alone, *search, _ALL_BITS, backend=backend)[0]
         winners.append(_best_planes(hypotheses, is_plane, competes, near, distance, first))
     runs = runs if at_once >= num_clouds else ()  # of all clouds
     planes, inliers = refine_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, runs, backend=backend)
-    return _face(planes, up, distance).to(points.device), inliers
+    return face_planes(planes, up, distance).to(points.device), inliers
 
 
 def _draw_triples(counts: list[int], num_hypotheses: int, seeds: list[int]) -> tuple[Tensor, Tensor]:
@@ -421,7 +421,7 @@ def _clouds_between(points: Tensor, ptr: Tensor, first: int, stop: int) -> tuple
     return points[int(own[0]) : int(own[-1])], own - own[0]
 
 
-def _face(planes: Tensor, ups: Tensor | None, distance: float) -> Tensor:
+def face_planes(planes: Tensor, ups: Tensor | None, distance: float) -> Tensor:
     """Turn the normals along ``up``, else toward an origin off the plane, else the largest component is positive."""
     normals, offset = planes[:, :3], planes[:, 3]
     along_up = torch.zeros_like(offset) if ups is None else torch.linalg.vecdot(normals, ups)

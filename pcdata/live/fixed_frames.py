@@ -26,6 +26,7 @@ from pcdata.functional.fixed_rows import FixedRows
 from pcdata.functional.image_grid import pixels_rise
 from pcdata.kernels.cuda.launching import launcher_of
 from pcdata.structures import DepthFrame, PointCloud
+from pcdata.structures.read_later import Metas
 from pcdata.structures.structure import derived
 from pcdata.transforms import Deproject
 from pcdata.transforms.base import Transform
@@ -40,7 +41,9 @@ class Seen:
     least: float  # depth
     largest: float
     is_same: bool  # as the frame before
-    bounds: list[list[int]] | None  # row pointers behind every step that gives clouds; None = ask the chain itself
+    bounds: list[list[int]]  # row pointers behind every step that gives clouds
+    told: list[list[float]]  # what else each of these had to say
+    is_usual: bool  # else the chain itself is to be asked
 
 
 class FixedFrames:
@@ -97,8 +100,9 @@ class FixedFrames:
                 stages.append(data)
             asks = torch.cat(flags).ne(0).any()
             told = [one.double().reshape(1) for one in (least, largest, is_same, asks)]
-            # Row pointers are below 2^53, so a double says them.
-            told += [stage.ptr.double() for stage in stages if isinstance(stage, FixedRows)]
+            for stage in stages:
+                if isinstance(stage, FixedRows):  # row pointers are below 2^53, so a double says them
+                    told += [stage.ptr.double(), *([] if stage.told is None else [stage.told.flatten()])]
             return torch.cat(told), stages
 
     def look(self, frame: DepthFrame) -> Seen | None:
@@ -111,20 +115,28 @@ class FixedFrames:
             if value is not None:
                 held[name].copy_(value.detach(), non_blocking=True)
         self._repeat()
-        least, largest, is_same, asks, *ptr = self._numbers.tolist()
-        size = frame.num_views + 1
-        bounds = [[int(bound) for bound in ptr[first : first + size]] for first in range(0, len(ptr), size)]
+        least, largest, is_same, asks, *numbers = self._numbers.tolist()
+        bounds, told = [], []
+        for stage in self._stages:
+            if isinstance(stage, FixedRows):
+                size = len(stage.ptr)
+                bounds.append([int(bound) for bound in numbers[:size]])
+                stop = size + (0 if stage.told is None else stage.told.numel())
+                told.append(numbers[size:stop])
+                del numbers[:stop]
         is_usual = not asks and all(stop > start for one in bounds for start, stop in pairwise(one))
-        return Seen(least, largest, bool(is_same), bounds if is_usual else None)
+        return Seen(least, largest, bool(is_same), bounds, told, is_usual)
 
-    def cloud(self, frame: DepthFrame, bounds: list[list[int]]) -> PointCloud | None:
+    def cloud(self, frame: DepthFrame, seen: Seen) -> PointCloud | None:
         """Return the cloud of the frame that was looked at, which is the caller's; None where a step refuses it."""
+        if not seen.is_usual:
+            return None
         try:
-            return self._cloud(frame, bounds)
+            return self._cloud(frame, seen.bounds, seen.told)
         except (PcdataError, Warning):  # a warning may be an error to the caller
             return None  # the chain itself says why
 
-    def _cloud(self, frame: DepthFrame, bounds: list[list[int]]) -> PointCloud:
+    def _cloud(self, frame: DepthFrame, bounds: list[list[int]], told: list[list[float]]) -> PointCloud:
         kinds = [isinstance(stage, FixedRows) for stage in self._stages]
         start = kinds.index(True)  # the deprojection
         for step in self.steps[:start]:
@@ -152,12 +164,19 @@ class FixedFrames:
         cloud = deproject.recorded_counts(cloud, None, counts[0], {})
         for place, step in enumerate(self.steps[start + 1 :]):
             before, after = counts[place : place + 2]
-            stage, params = self._stages[start + 1 + place], {}
-            if stage.chosen is not self._stages[start + place].chosen:
+            earlier, stage = self._stages[start + place : start + place + 2]
+            given, params = derived(cloud, ptr=ptrs[place]), {}
+            if stage.chosen is not earlier.chosen:
                 room = bounds[place][-1] if stage.chosen.dtype is torch.bool else len(stage.chosen)
                 params = {"index": stage.chosen[:room].clone(), "ptr": ptrs[place + 1]}
-            told = step.told_rows(derived(cloud, ptr=ptrs[place]), params)
-            cloud = step.recorded_counts(cloud, before, after, params, rows=told)
+            if stage.told is not None:
+                given = derived(given, points=earlier.points[: bounds[place][-1]].clone())
+                numbers = torch.tensor(told[place + 1], dtype=torch.float64, device="cpu").view_as(stage.told)
+                params, facts = step.fixed_facts(given, params, numbers)
+                held = vars(cloud)["meta"]
+                cloud = derived(cloud, meta=(held if isinstance(held, Metas) else Metas([held])).then(facts))
+            rows_told = step.told_rows(given, params)
+            cloud = step.recorded_counts(cloud, before, after, params, rows=rows_told)
         return cloud
 
     def __repr__(self) -> str:

@@ -72,7 +72,8 @@ class LivePipeline:
         same_pixels: whether a frame equal to the one before in every depth pixel is frozen. No sensor gives one; a
             simulator without noise does.
         warm_planes: let RemovePlane score the plane of the frame before first. A wrong one loses, and a good one is
-            refined in fewer rounds; but what is found is no longer bit for bit what the chain finds offline.
+            refined in fewer rounds; but what is found is no longer bit for bit what the chain finds offline. Nothing
+            changes where a GPU has captured the step.
         seed: needed where steps are random: each frame is drawn for anew with it.
 
     Raises:
@@ -249,13 +250,13 @@ class LivePipeline:
                 if seen is None:
                     self._since = since
                     seen = self._fixed.look(frame)
-                begun = None if seen is None or seen.bounds is None else self._fixed.cloud(frame, seen.bounds)
+                begun = None if seen is None else self._fixed.cloud(frame, seen)
                 if begun is not None:
                     chain, data, since = self._rest, begun, self._since
                     after(range(len(self._fixed.steps)), data)
                     done = len(self._fixed.steps)
             cloud: PointCloud = chain.run_in_passes(data, generator=generator, after=after)
-        if self._warm_planes:
+        if self._warm_planes and "RemovePlane" not in self.captured:  # which searches anew, and tells later
             self._planes = cloud.meta[0].get("planes", ())
         return cloud
 

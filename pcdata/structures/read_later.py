@@ -6,7 +6,7 @@ So a step of a batch is noted once, and not in a dictionary for each of its clou
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
@@ -129,6 +129,34 @@ def _parsed(name: str, text: bytes, kind: type, told: Any) -> list[Any]:
     if not (isinstance(stored, list) and len(stored) == 1 and isinstance(stored[0], kind)):
         raise CacheError(f"the {name} of a cloud must be a {kind.__name__}, got {stored!r:.100}; rebuild the dataset")
     return stored
+
+
+class MadeWhenRead:
+    """Facts of each of B clouds that cost something to find out: found out when somebody reads them."""
+
+    __slots__ = ("_count", "_found", "_make")
+
+    def __init__(self, count: int, make: Callable[[], Sequence[Step]]) -> None:
+        self._count, self._make = count, make
+        self._found: Sequence[Step] | None = None
+
+    def __len__(self) -> int:
+        return self._count
+
+    def _all(self) -> Sequence[Step]:
+        if self._found is None:
+            self._found = self._make()
+            del self._make  # and the memory that it looked at
+        return self._found
+
+    def __getitem__(self, clouds: slice) -> MadeWhenRead:
+        return MadeWhenRead(len(range(*clouds.indices(self._count))), lambda: self._all()[clouds])
+
+    def __iter__(self) -> Iterator[Step]:
+        return map(dict, self._all())
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return list, (list(self),)
 
 
 # -- as clouds hold them -----------------------------------------------------------------------------------------------

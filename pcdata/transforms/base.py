@@ -33,6 +33,7 @@ from pcdata.errors import (
 from pcdata.registry import Registry
 from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
+from pcdata.structures.read_later import OfClouds
 from pcdata.transforms.class_checks import check_class, undeclared_streams, watched
 from pcdata.transforms.decisions import (
     LISTS,
@@ -118,6 +119,16 @@ class Transform(nn.Module):
         so a device can repeat what it started: values are looked at there alone.
         """
         return None
+
+    def fixed_facts(self, before: PointCloud, params: Params, told: Tensor) -> tuple[Params, OfClouds]:
+        """Return the params of what :meth:`fixed_work` did, and what joins the meta of each cloud.
+
+        Args:
+            before: the clouds that the step was given, points alone.
+            params: which rows were chosen: ``index`` and ``ptr``.
+            told: (B, K) float64 that the work had for the host.
+        """
+        raise NotImplementedError(f"{type(self).__name__}: write the method fixed_facts(self, before, params, told)")
 
     def repeat(self, data: Any, decided: Decisions) -> Params:
         """Decide as the history tells, on the data that it is of or on others.

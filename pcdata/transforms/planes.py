@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -13,9 +13,13 @@ import torch
 from annotated_types import Ge, Interval
 from torch import Tensor
 
+from pcdata.contracts.asked_later import is_set
+from pcdata.contracts.dispatch import roomy_body
 from pcdata.contracts.host import negated
 from pcdata.contracts.on_host import bounds_of, counts_of
 from pcdata.errors import ConfigError, PcdataWarning
+from pcdata.functional.fixed_rows import FixedRows, move_kept
+from pcdata.functional.largest_planes import words_drawn
 from pcdata.functional.plane_patch import plane_patch
 from pcdata.functional.plane_segments import supporting_plane
 from pcdata.functional.planes import near_planes, ransac_plane
@@ -26,6 +30,7 @@ from pcdata.geometry import rigid
 from pcdata.geometry.plane_fit import through_origin
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, METRE, PointCloud
+from pcdata.structures.read_later import MadeWhenRead, OfClouds
 from pcdata.threads import torch_on_one_thread
 from pcdata.transforms.base import Params, sample_name
 from pcdata.transforms.decisions import Decisions
@@ -252,6 +257,41 @@ class RemovePlane(RemoveTransform):
     @torch_on_one_thread()
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Keep the rows and store the planes in the source frame."""
+        return data.select(params["index"], params["ptr"]).with_meta(self._entries(data, params))
+
+    def fixed_work(self, like: FixedRows) -> Callable[[FixedRows], FixedRows] | None:
+        """Find the plane with the most inliers and remove the slab about it; whatever else is asked needs the host."""
+        device = like.points.device
+        body = roomy_body("largest_planes", device)
+        is_plain = (self.which, self.cut, self.keep, self.up) == ("largest", "slab", "both", None)
+        if body is None or not is_plain or like.normals is not None:
+            return None
+        if words_drawn(self.seed, self.num_hypotheses, device) is None:
+            return None
+
+        def work(rows: FixedRows) -> FixedRows:
+            fields = self.distance, self.num_hypotheses, self.seed, self.probability
+            planes, near, failed = body(rows.points, rows.ptr, *fields)
+            is_set(failed)
+            keep = ~near
+            kept = move_kept(rows.points, rows.source_index, rows.ptr, keep)
+            return FixedRows(*kept, rows.viewpoint, keep, told=planes)
+
+        return work
+
+    def fixed_facts(self, before: PointCloud, params: Params, told: Tensor) -> tuple[Params, OfClouds]:
+        """Tell the planes, and find out where their surfaces end when somebody reads it."""
+        had, left = counts_of(before.ptr), counts_of(params["ptr"])
+        inliers = torch.tensor([a - b for a, b in zip(had, left)], dtype=torch.int64, device="cpu")
+        found = {**params, "planes": told, "num_inliers": inliers}
+
+        def entries() -> list[dict[str, Any]]:
+            return self._entries(before, self._apart(before, told, negated(params["index"])) | found)
+
+        return found, MadeWhenRead(len(had), entries)
+
+    def _entries(self, data: PointCloud, params: Params) -> list[dict[str, Any]]:
+        """Return what the meta of each cloud is told of its plane."""
         entries: list[dict[str, Any]] = []
         for b, (start, stop) in enumerate(pairwise(bounds_of(data.ptr))):
             plane = params["planes"][b]
@@ -268,7 +308,7 @@ class RemovePlane(RemoveTransform):
                 found["tilt"] = self._tilt(plane)
                 self._warn_of_tilt(data, b, found["tilt"])
             entries.append({"planes": [*data.meta[b].get("planes", []), found]})
-        return super().transform(data, params).with_meta(entries)
+        return entries
 
     def _warn_of_no_table(self, data: PointCloud, b: int, cut: str) -> None:
         """Say that the table could not be measured."""

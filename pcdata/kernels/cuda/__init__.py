@@ -7,6 +7,7 @@ from pcdata.kernels.cuda import compaction as cuda_compaction
 from pcdata.kernels.cuda import deprojection as cuda_deprojection
 from pcdata.kernels.cuda import depth_filters as cuda_depth_filters
 from pcdata.kernels.cuda import holes as cuda_holes
+from pcdata.kernels.cuda import largest_planes as cuda_largest_planes
 from pcdata.kernels.cuda import motions as cuda_motions
 from pcdata.kernels.cuda import neighbors as cuda_neighbors
 from pcdata.kernels.cuda import outliers as cuda_outliers
@@ -23,6 +24,7 @@ __all__ = [
     "cuda_deprojection",
     "cuda_depth_filters",
     "cuda_holes",
+    "cuda_largest_planes",
     "cuda_motions",
     "cuda_neighbors",
     "cuda_outliers",

@@ -15,7 +15,7 @@ from pcdata.geometry.plane_fit import plane_of_moments
 from pcdata.kernels.cuda.launching import BLOCK, Launcher, launcher_of
 
 _ROWS_OF_A_BLOCK = 2048
-_SUMS = 12  # kPlaneSums of the kernel
+SUMS = 12  # kPlaneSums of the kernel
 
 
 @kernel("draw_planes", "cuda")
@@ -46,7 +46,7 @@ def record_planes(
     launcher, device = launcher_of(points), points.device
     asked = planes.float().masked_fill(~competes[..., None], torch.nan).to(device)
     found = torch.zeros((clouds, some), dtype=torch.int32, device=device)
-    blocks = _blocks_of_a_cloud(launcher, len(points), clouds)
+    blocks = blocks_of_a_cloud(launcher, len(points), clouds)
     launcher.launch_blocks(
         "pc_count_near_planes",
         *(clouds * blocks, points.contiguous(), ptr.contiguous(), blocks, asked, some, float(distance), found),
@@ -119,8 +119,8 @@ def _marked(
     """Return the points near their cloud's plane (N,) bool, and the sums over these (B, 12) float64 on the CPU."""
     launcher, clouds = launcher_of(points), len(planes)
     near = torch.zeros_like(before)
-    blocks = _blocks_of_a_cloud(launcher, len(points), clouds)
-    sums = torch.empty((clouds, blocks, _SUMS), dtype=torch.float64, device=points.device)
+    blocks = blocks_of_a_cloud(launcher, len(points), clouds)
+    sums = torch.empty((clouds, blocks, SUMS), dtype=torch.float64, device=points.device)
     asked = planes.float().to(points.device)
     launcher.launch_blocks(
         "pc_mark_near_plane",
@@ -141,7 +141,7 @@ def _fitted(sums: Tensor, origins: Tensor) -> Tensor:
     return planes.masked_fill(sums[:, :1] < 3, torch.nan)
 
 
-def _blocks_of_a_cloud(launcher: Launcher, rows: int, clouds: int) -> int:
+def blocks_of_a_cloud(launcher: Launcher, rows: int, clouds: int) -> int:
     """Return how many blocks share each cloud: no more than keep the device busy."""
     busy = launcher.busy_threads() // BLOCK
     return max(1, min(-(-rows // (clouds * _ROWS_OF_A_BLOCK)), 8 * busy // clouds))

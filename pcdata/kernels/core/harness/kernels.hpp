@@ -12,6 +12,7 @@
 #include "pc/gpu/motions.hpp"
 #include "pc/gpu/nearest.hpp"
 #include "pc/gpu/organized.hpp"
+#include "pc/gpu/plane_search.hpp"
 #include "pc/gpu/planes.hpp"
 #include "pc/gpu/radius.hpp"
 #include "pc/gpu/registration.hpp"
