@@ -169,7 +169,7 @@ def _projected(lens: str) -> dict[str, Any]:
 
 
 FIELD = tsdf.VoxelGrid(0.02, 0.1)
-FUSIONS = ("touched_blocks", "find_blocks", "integrate_view", "find_crossings", "find_triangles")
+FUSIONS = ("touched_blocks", "find_blocks", "locate_views", "integrate_view", "find_crossings", "find_triangles")
 
 
 def _view(number: int) -> Any:
@@ -196,6 +196,8 @@ def _fusion(name: str) -> dict[str, Any]:
         return {"view": second, "grid": FIELD}
     blocks = tsdf.VoxelBlocks(tsdf.voxel_planes(colors=True, labels=True, views=True), torch.device("cpu"))
     blocks.add(tsdf.touched_blocks(first, FIELD, backend="torch"))
+    if name == "locate_views":
+        return {"blocks": blocks, "views": [first, second], "grid": FIELD}
     keys = tsdf.touched_blocks(second, FIELD, backend="torch")
     if name == "find_blocks":
         return {"blocks": blocks, "keys": keys}

@@ -4,7 +4,7 @@
     PYTHONPATH=. python benchmarks/gpu.py  # writes results/gpu.json
     PYTHONPATH=. python benchmarks/gpu.py --rehearse   # without a GPU, on the device of the tests; keeps nothing
 
-Parity: the examples of the contract suites, by every backend that serves them, and a fused volume. Masks, indices and
+Parity: the examples of the contract suites and fused fields, by every backend that serves them. Masks, indices and
 labels are the same; other numbers differ by at most 2e-6. Timings: medians of wall time, synchronized before and after,
 on a warm device, for a synthetic 1280x720 frame; ``waits`` counts the calls in which torch says that the host waited,
 ``kernels`` those of pcdata that were started: none means that plain torch ran. One error stops nothing: it is a row,
@@ -97,14 +97,16 @@ def about(device: torch.device) -> dict[str, Any]:
 def parity_cases(device: torch.device) -> Iterator[tuple[str, Callable[[], list[str]]]]:
     """Yield names, and calls that return what differs."""
     for example in operations.EXAMPLES:
-        for backend in dispatch.AUTO_ORDER.get(device.type, dispatch.OTHER_DEVICES):
-            if dispatch.why_unavailable(backend) is None and dispatch.OPERATIONS[example.name].serves(backend):
-                name = f"{example.name} ({example.cloud.__name__}) by {backend}"
-                yield name, lambda e=example, b=backend: operation_differences(e, device, b)
+        for backend in live_backends(device, example.name):
+            name = f"{example.name} ({example.cloud.__name__}) by {backend}"
+            yield name, lambda e=example, b=backend: operation_differences(e, device, b)
     for name, examples in steps.EXAMPLES.items():
         for number, example in enumerate(examples):
             yield f"{name} ({number})", lambda e=example: step_differences(e, device)
-    yield "TSDFVolume", lambda: volume_differences(device)
+    for backend in live_backends(device, "integrate_view"):
+        for options in ({}, {"weighting": "angle", "carve": "everywhere"}, {"carve": "never"}):
+            name = f"TSDFVolume {options or ''} by {backend}"
+            yield name, lambda b=backend, o=options: volume_differences(device, b, o)
 
 
 def operation_differences(example: operations.Example, device: torch.device, backend: str) -> list[str]:
@@ -140,20 +142,37 @@ def step_differences(example: Any, device: torch.device) -> list[str]:
     return list(differences(tree(steps.run(example, data)), tree(found.to("cpu")), tolerance=TOLERANCE))
 
 
-def volume_differences(device: torch.device) -> list[str]:
-    def fused(where: torch.device) -> TSDFVolume:
-        volume = TSDFVolume(voxel_size=0.01, backend="torch", device=where)
+def volume_differences(device: torch.device, backend: str, options: dict[str, Any]) -> list[str]:
+    """Compare a field of two captures, every stored bit of it, and its surface."""
+    size, voxel_size = ((120, 160), 0.01) if device.type == "cuda" else ((24, 32), 0.04)
+
+    def fused(where: torch.device, by: str) -> TSDFVolume:
+        volume = TSDFVolume(voxel_size=voxel_size, backend=by, device=where, **options)
         for seed in range(2):
-            volume.integrate(tabletop(seed, size=(120, 160)).frame.to(where))
+            volume.integrate(tabletop(seed, size=size, num_views=2).frame.to(where))
         return volume
 
-    here, there = fused(torch.device("cpu")), fused(device)
-    keys = apart(there.blocks.keys, here.blocks.keys, device)
-    return (
-        [keys]
-        if keys
-        else list(differences(tree(here.extract_points()), tree(there.extract_points().to("cpu")), tolerance=1e-5))
+    here, there = fused(torch.device("cpu"), "torch"), fused(device, backend)
+    assert here.blocks is not None
+    assert there.blocks is not None
+    told = [f"keys: {found}"] if (found := apart(there.blocks.keys, here.blocks.keys, device)) else []
+    for one, other in zip(there.blocks.chunks, here.blocks.chunks):
+        told += [f"{name}: {found}" for name in other if (found := apart(one[name], other[name], device))]
+    told += differences(tree(here.extract_points()), tree(there.extract_points().to("cpu")), tolerance=TOLERANCE)
+    return told + list(
+        differences(tree(here.extract_mesh()), tree(there.extract_mesh().to("cpu")), tolerance=TOLERANCE)
     )
+
+
+def live_backends(device: torch.device, *names: str) -> list[str]:
+    """Return the backends that serve operations there, the references last."""
+    ordered = dispatch.AUTO_ORDER.get(device.type, dispatch.OTHER_DEVICES)
+    return [
+        backend
+        for backend in ordered
+        if dispatch.why_unavailable(backend) is None
+        and all(dispatch.OPERATIONS[name].serves(backend) for name in names)
+    ]
 
 
 def compared(name: str, compare: Callable[[], list[str]]) -> dict[str, Any]:
@@ -227,9 +246,11 @@ def timing_cases(device: torch.device, size: tuple[int, int]) -> Iterator[tuple[
     yield "chain to 1024 points, four clouds", 4.0, lambda: [chain(frame) for _ in range(4)]
     for cameras, goal in ((1, 2.0), (4, 4.0)):
         yield f"captured chain, {cameras} cameras", goal, live_call(cameras, size, device, chain)
-    volume = TSDFVolume(voxel_size=0.004, backend="auto", device=device)
-    yield "TSDF 4 mm, integrate", 0.3, lambda: volume.integrate(frame)
-    yield "TSDF 4 mm, extract", 0.5, lambda: volume.extract_points()
+    for backend in live_backends(device, "integrate_view"):
+        volume = TSDFVolume(voxel_size=0.02 if size[0] < 100 else 0.002, backend=backend, device=device)
+        yield f"TSDF 2 mm, colors and labels, by {backend}", 0.3, lambda v=volume: v.integrate(frame)
+        yield f"TSDF 2 mm, points by {backend}", 0.5, lambda v=volume: v.extract_points()
+        yield f"TSDF 2 mm, triangles by {backend}", None, lambda v=volume: v.extract_mesh()
 
 
 def depth_cases(frame: DepthFrame) -> Iterator[tuple[str, float | None, Callable[[], Any]]]:

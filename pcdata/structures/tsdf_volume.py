@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from pcdata.contracts.on_host import on_host
 from pcdata.errors import CaptureError, ConfigError, DeviceError, DTypeError, FrameError, VolumeTooLargeError
 from pcdata.functional import tsdf
 from pcdata.functional.depth.confidence import Confidence
@@ -101,19 +102,16 @@ class TSDFVolume:
             DeviceError: it is on another device.
             UnitError: a reading lies 2^20 blocks or more from the origin.
         """
-        views, touched = self._prepared(frame)
-        found, new = self._found(touched)
+        blocks, views, found, new = self._located(frame)
         self._check_room(frame, len(new))
         if self.blocks is None:
             self.frame_id = frame.frame_id
-            self.blocks = tsdf.VoxelBlocks(self._planes_of(frame), frame.device)
-        self.blocks.add(new)
-        if len(new) or not found:
-            found = [tsdf.find_blocks(self.blocks, keys, backend=self.backend)[0] for keys in touched]
+            self.blocks = blocks
+        blocks.add(new)
         for view, rows in zip(views, found, strict=True):
             if self.carve == "everywhere":
-                rows = torch.arange(len(self.blocks), dtype=torch.int64, device=frame.device)
-            tsdf.integrate_view(self.blocks, rows, view, self.grid, carve=self.carve != "never", backend=self.backend)
+                rows = torch.arange(len(blocks), dtype=torch.int64, device=frame.device)
+            tsdf.integrate_view(blocks, rows, view, self.grid, carve=self.carve != "never", backend=self.backend)
         self.num_views += len(views)
 
     def estimate_bytes(self, frame: DepthFrame) -> int:
@@ -122,22 +120,15 @@ class TSDFVolume:
         Raises:
             FrameError, CaptureError, DeviceError, UnitError: as :meth:`integrate`.
         """
-        _, touched = self._prepared(frame)
-        return (self.num_blocks + len(self._found(touched)[1])) * tsdf.bytes_per_block(self._planes_of(frame))
+        _, _, _, new = self._located(frame)
+        return (self.num_blocks + len(new)) * tsdf.bytes_per_block(self._planes_of(frame))
 
-    def _prepared(self, frame: DepthFrame) -> tuple[list[tsdf.FusionView], list[Tensor]]:
+    def _located(self, frame: DepthFrame) -> tuple[tsdf.VoxelBlocks, list[tsdf.FusionView], list[Tensor], Tensor]:
+        """Return the blocks, the views of a frame that fits, the rows of their blocks, and the keys to add first."""
         self._check_frame(frame)
         views = [self._view(frame, index) for index in range(frame.num_views)]
-        return views, [tsdf.touched_blocks(view, self.grid, backend=self.backend) for view in views]
-
-    def _found(self, touched: list[Tensor]) -> tuple[list[Tensor], Tensor]:
-        """Return the rows of every view's blocks, -1 where there is none, and the sorted keys of those."""
-        if self.blocks is None:
-            found, missing = [], touched
-        else:
-            both = [tsdf.find_blocks(self.blocks, keys, backend=self.backend) for keys in touched]
-            found, missing = [rows for rows, _ in both], [keys for _, keys in both]
-        return found, missing[0] if len(missing) == 1 else torch.cat(missing).unique()
+        blocks = tsdf.VoxelBlocks(self._planes_of(frame), frame.device) if self.blocks is None else self.blocks
+        return blocks, views, *tsdf.locate_views(blocks, views, self.grid, backend=self.backend)
 
     def _check_room(self, frame: DepthFrame, new: int) -> None:
         per_block = tsdf.bytes_per_block(self._planes_of(frame))
@@ -180,8 +171,8 @@ class TSDFVolume:
 
     def _view(self, frame: DepthFrame, index: int) -> tsdf.FusionView:
         camera = frame.camera
-        k = camera.intrinsics[index]
-        lens = None if camera.distortion is None else camera.distortion[index]
+        k = on_host(camera.intrinsics)[index]
+        lens = None if camera.distortion is None else on_host(camera.distortion)[index]
         rays, directions = self._rays(k, lens, frame)
         depth = frame.depth[index]
         if self.min_confidence is not None and frame.confidence is not None:
@@ -194,7 +185,7 @@ class TSDFVolume:
             rays=directions,
             pinhole=(float(k[0, 0]), float(k[0, 1]), float(k[0, 2]), float(k[1, 1]), float(k[1, 2])),
             distortion=None if lens is None else pad(lens.double(), (0, max(0, WIDEST_PLAIN - len(lens)))),
-            world_from_camera=frame.world_from_camera[index],
+            world_from_camera=on_host(frame.world_from_camera)[index],
             weight=tsdf.weight_image(depth, rays, self.weighting),
             color=None if frame.colors is None else tsdf.pack_colors(frame.colors[index], backend=self.backend),
             label=None if frame.labels is None else tsdf.pack_labels(frame.labels[index]),

@@ -56,6 +56,7 @@ WITHOUT = {
     "statistical_outlier_mask",
     # steps of fusion
     "find_blocks",
+    "locate_views",
     "find_crossings",
     "find_triangles",
     "integrate_view",

@@ -2,7 +2,7 @@
 
 from pcdata.functional.tsdf.blocks import VoxelBlocks, bytes_per_block, voxel_planes
 from pcdata.functional.tsdf.grid import VoxelGrid
-from pcdata.functional.tsdf.integrate import find_blocks, integrate_view, touched_blocks
+from pcdata.functional.tsdf.integrate import find_blocks, integrate_view, locate_views, touched_blocks
 from pcdata.functional.tsdf.marching import find_triangles
 from pcdata.functional.tsdf.surface import Crossings, find_crossings
 from pcdata.functional.tsdf.views import (
@@ -28,6 +28,7 @@ __all__ = [
     "find_triangles",
     "fit_labels",
     "integrate_view",
+    "locate_views",
     "pack_colors",
     "pack_labels",
     "touched_blocks",

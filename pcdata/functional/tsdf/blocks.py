@@ -130,19 +130,16 @@ class VoxelBlocks:
         return torch.where(sorted_keys[place] == keys, sorted_rows[place], -1)
 
     def _merged(self) -> tuple[Tensor, Tensor]:
-        """Merge what was added since the last time into the sorted keys: it goes behind the known keys below it."""
+        """Merge what was added since the last time into the sorted keys: a key goes behind all those below it."""
         known_keys, known_rows = self._sorted
         known = len(known_keys)
         if known < self._count:
             keys, order = self.keys[known:].sort()
-            places = torch.searchsorted(known_keys, keys) + torch.arange(
-                len(keys), dtype=torch.int64, device=self.device
-            )
-            is_known = torch.ones(self._count, dtype=torch.bool, device=self.device)
-            is_known[places] = False
             merged_keys, merged_rows = torch.empty_like(self.keys), torch.empty_like(self.keys)
-            merged_keys[places], merged_rows[places] = keys, order + known
-            merged_keys[is_known], merged_rows[is_known] = known_keys, known_rows
+            for own, others, rows in ((keys, known_keys, order + known), (known_keys, keys, known_rows)):
+                places = torch.searchsorted(others, own)
+                places += torch.arange(len(own), dtype=torch.int64, device=self.device)
+                merged_keys[places], merged_rows[places] = own, rows
             self._sorted = merged_keys, merged_rows
         return self._sorted
 

@@ -7,13 +7,16 @@ MJRTY, 1991.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
+from pcdata.contracts.on_host import on_host, uploaded
 from pcdata.functional.tsdf.blocks import BLOCKS, MAX_WEIGHT, TSDF_SCALE, Chunk, VoxelBlocks
 from pcdata.functional.tsdf.grid import GRID, VoxelGrid, pack_keys, unpack_keys, voxel_offsets
-from pcdata.functional.tsdf.views import VIEW, FusionView
+from pcdata.functional.tsdf.views import VIEW, VIEWS, FusionView
 from pcdata.geometry.lens import distort_normalized
 from pcdata.geometry.lens_models import is_plain
 from pcdata.threads import at_once
@@ -30,6 +33,7 @@ def touched_blocks(view: FusionView, grid: VoxelGrid, *, backend: str = "auto") 
     Along the ray of every reading, blocks are looked up half a block apart, from one truncation in front to one behind.
     """
     turn, fraction, camera = camera_in_blocks(view, grid)
+    camera = uploaded(camera, view.depth.device)
     read = view.depth > 0
     depth, (x, y) = view.depth[read], view.rays[:, read]
     along = [(t[0] * x + t[1] * y) + t[2] for t in turn]
@@ -49,16 +53,45 @@ def find_blocks(blocks: VoxelBlocks, keys: Tensor, *, backend: str = "auto") -> 
     return rows, keys[rows < 0]
 
 
+@op(blocks=BLOCKS, views=VIEWS, grid=GRID, gradient=False)
+def locate_views(
+    blocks: VoxelBlocks, views: Sequence[FusionView], grid: VoxelGrid, *, backend: str = "auto"
+) -> tuple[list[Tensor], Tensor]:
+    """Return the rows (N,) of the blocks that each view touches, in key order, and the sorted keys (M,) of new ones.
+
+    A missing block has the row that it gets when these keys are added next.
+    """
+    touched = [touched_blocks(view, grid, backend="torch") for view in views]
+    found = [find_blocks(blocks, keys, backend="torch") for keys in touched]
+    return located(blocks, touched, found)
+
+
+def located(
+    blocks: VoxelBlocks, touched: Sequence[Tensor], found: Sequence[tuple[Tensor, Tensor]]
+) -> tuple[list[Tensor], Tensor]:
+    """Put together what was found of the keys that each view touches."""
+    missing = found[0][1] if len(found) == 1 else torch.cat([keys for _, keys in found]).unique()
+    return [with_new_rows(blocks, rows, keys, missing) for (rows, _), keys in zip(found, touched)], missing
+
+
+def with_new_rows(blocks: VoxelBlocks, rows: Tensor, keys: Tensor, missing: Tensor) -> Tensor:
+    """Give missing blocks, row -1, the rows that they will have."""
+    if len(missing) == 0:
+        return rows
+    return torch.where(rows < 0, torch.searchsorted(missing, keys) + len(blocks), rows)
+
+
 def camera_in_blocks(view: FusionView, grid: VoxelGrid) -> tuple[Tensor, Tensor, Tensor]:
     """Return how to count blocks from the camera's own, in float32 without losing any, however far the origin is.
 
     The rotation in blocks per metre (3, 3) float32, the camera's place within its block (3,) float32, and that block
-    (3,) int64.
+    (3,) int64; all on the host.
     """
-    place = view.world_from_camera[:3, 3] / grid.block_size
+    pose = on_host(view.world_from_camera)
+    place = pose[:3, 3] / grid.block_size
     block = place.floor()
     return (
-        (view.world_from_camera[:3, :3] / grid.block_size).float(),
+        (pose[:3, :3] / grid.block_size).float(),
         (place - block).float(),
         block.clamp(-_FURTHEST, _FURTHEST).long(),
     )
@@ -114,14 +147,13 @@ def image_from_world(view: FusionView) -> Tensor:
     """Return (3, 4) float64: the place of a point in the image, times its depth, and the depth.
 
     Pixel (u, v) is where the place is in [u, u + 1) x [v, v + 1). With a lens, which is not linear: the point in the
-    camera's frame.
+    camera's frame. It is on the host.
     """
     if view.distortion is not None:
         return view.camera_from_world[:3]
     fx, skew, cx, fy, cy = view.pinhole
     image = [[fx, skew, cx + 0.5], [0.0, fy, cy + 0.5], [0.0, 0.0, 1.0]]
-    pose = view.camera_from_world
-    return torch.tensor(image, dtype=torch.float64, device=pose.device) @ pose[:3]
+    return torch.tensor(image, dtype=torch.float64, device="cpu") @ view.camera_from_world[:3]
 
 
 def block_corners(keys: Tensor, view: FusionView, grid: VoxelGrid) -> Tensor:
@@ -134,7 +166,7 @@ def block_corners(keys: Tensor, view: FusionView, grid: VoxelGrid) -> Tensor:
 def voxel_steps(view: FusionView, grid: VoxelGrid) -> Tensor:
     """Return (3, 512) float32: where a block's voxels lie from its first one, as the view maps them."""
     steps = (image_from_world(view)[:, :3] * grid.voxel_size).float()
-    x, y, z = voxel_offsets(steps.device).float().unbind(-1)
+    x, y, z = voxel_offsets(view.depth.device).float().unbind(-1)
     return torch.stack([(x * s[0] + y * s[1]) + z * s[2] for s in steps])
 
 
@@ -149,10 +181,11 @@ def _distances(corners: Tensor, view: FusionView, grid: VoxelGrid) -> tuple[Tens
         radius = u * u + v * v
         ahead &= radius < torch.tensor(view.fold, dtype=torch.float32, device="cpu")
         if is_plain(view.distortion):
-            x, y = bend(u, v, radius, view.distortion.float())
+            x, y = bend(u, v, radius, on_host(view.distortion).float())
         else:
             seen = torch.stack([torch.where(ahead, one, 0.0) for one in (u, v)], dim=-1)
-            x, y = distort_normalized(seen[None], view.distortion[None])[0].float().unbind(-1)
+            lens = uploaded(on_host(view.distortion), seen.device)
+            x, y = distort_normalized(seen[None], lens[None])[0].float().unbind(-1)
         fx, skew, cx, fy, cy = torch.tensor(view.pinhole, dtype=torch.float32, device="cpu").unbind()
         u, v = ((x * fx + y * skew) + cx) + 0.5, (y * fy + cy) + 0.5
     inside = ahead & (u >= 0) & (u < width) & (v >= 0) & (v < height)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_count
+from pcdata.contracts.on_host import uploaded
 from pcdata.functional.tsdf.blocks import BLOCKS, VoxelBlocks
 from pcdata.functional.tsdf.grid import EDGE, VOXELS
 from pcdata.functional.tsdf.margins import SIDE, own_places, plane_with_margin, rows_around
@@ -104,7 +105,7 @@ def tensor_tables(device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
     axis = torch.tensor(
         [[(b - a).bit_length() - 1 for a, b in triangle] for triangle in flat], dtype=torch.int64, device="cpu"
     )
-    return counts.to(device), start.to(device), axis.to(device)
+    return uploaded(counts, device), uploaded(start, device), uploaded(axis, device)
 
 
 def _triangles_of(

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import op
-from pcdata.contracts.fields import Fields
+from pcdata.contracts.fields import Fields, Several
+from pcdata.contracts.on_host import on_host
 from pcdata.functional.tsdf.blocks import COLOR_SCALE
 from pcdata.geometry import rigid
 from pcdata.geometry.lens import fold_radius
@@ -37,26 +38,26 @@ class FusionView:
 
     @property
     def camera_from_world(self) -> Tensor:
-        """The pose the other way, (4, 4) float64."""
-        return rigid.invert_rigid(self.world_from_camera)
+        """The pose the other way, (4, 4) float64, on the host."""
+        return rigid.invert_rigid(on_host(self.world_from_camera))
 
     @property
     def fold(self) -> float:
         """The squared radius from which on the lens model folds back; infinite without a lens."""
-        return float("inf") if self.distortion is None else float(fold_radius(self.distortion[None])) ** 2
+        return float("inf") if self.distortion is None else float(fold_radius(on_host(self.distortion)[None])) ** 2
 
 
-# The spec of a view: what kernels read.
-VIEW = Fields(
-    FusionView,
-    depth="H W",
-    rays="2 H W",
-    distortion="D : float64",
-    world_from_camera="4 4 : float64",
-    weight="H W : int32",
-    color="H W : int32",
-    label="H W : int32",
-)
+_NUMBERS = {"distortion": "D : float64", "world_from_camera": "4 4 : float64"}
+_TENSORS = {
+    "depth": "H W",
+    "rays": "2 H W",
+    "weight": "H W : int32",
+    "color": "H W : int32",
+    "label": "H W : int32",
+}
+# The spec of a view, and of several: what kernels read.
+VIEW = Fields(FusionView, numbers=_NUMBERS, **_TENSORS)
+VIEWS = Several(VIEW)
 
 
 @op(colors="H W 3 : uint8", gradient=False)
@@ -72,8 +73,11 @@ def pack_colors(
 
 def fit_labels(labels: Tensor) -> bool:
     """Say whether int64 labels fit the 32 bits of a voxel."""
-    found = labels.numpy() if labels.device.type == "cpu" else labels  # see pcdata.contracts.tensors on NumPy
-    return int(found.min()) >= -(2**31) and int(found.max()) < 2**31
+    if labels.device.type == "cpu":
+        found = labels.numpy()  # see pcdata.contracts.tensors on NumPy
+        return int(found.min()) >= -(2**31) and int(found.max()) < 2**31
+    low, high = torch.stack(labels.aminmax()).tolist()
+    return bool(low >= -(2**31) and high < 2**31)
 
 
 def pack_labels(labels: Tensor) -> Tensor:

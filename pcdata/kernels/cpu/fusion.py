@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -35,6 +37,13 @@ def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
         keys: Tensor = OPERATIONS["touched_blocks"].reference(view, grid)  # knows what to say
         return keys
     return torch.from_numpy(found[: int(count)].numpy().copy())
+
+
+@kernel("locate_views", "cpu")
+def locate_views(blocks: VoxelBlocks, views: Sequence[FusionView], grid: VoxelGrid) -> tuple[list[Tensor], Tensor]:
+    """Take one view after another, each with all threads."""
+    touched = [touched_blocks(view, grid) for view in views]
+    return integrate.located(blocks, touched, [find_blocks(blocks, keys) for keys in touched])
 
 
 @kernel("pack_colors", "cpu")

@@ -6,6 +6,7 @@ from pcdata.kernels.cuda import clusters as cuda_clusters
 from pcdata.kernels.cuda import compaction as cuda_compaction
 from pcdata.kernels.cuda import deprojection as cuda_deprojection
 from pcdata.kernels.cuda import depth_filters as cuda_depth_filters
+from pcdata.kernels.cuda import fusion as cuda_fusion
 from pcdata.kernels.cuda import holes as cuda_holes
 from pcdata.kernels.cuda import largest_planes as cuda_largest_planes
 from pcdata.kernels.cuda import motions as cuda_motions
@@ -15,6 +16,7 @@ from pcdata.kernels.cuda import planes as cuda_planes
 from pcdata.kernels.cuda import registration as cuda_registration
 from pcdata.kernels.cuda import resampling as cuda_resampling
 from pcdata.kernels.cuda import sampling as cuda_sampling
+from pcdata.kernels.cuda import surfaces as cuda_surfaces
 from pcdata.kernels.cuda import voxels as cuda_voxels
 from pcdata.kernels.cuda.gpu import unavailable
 
@@ -23,6 +25,7 @@ __all__ = [
     "cuda_compaction",
     "cuda_deprojection",
     "cuda_depth_filters",
+    "cuda_fusion",
     "cuda_holes",
     "cuda_largest_planes",
     "cuda_motions",
@@ -32,6 +35,7 @@ __all__ = [
     "cuda_registration",
     "cuda_resampling",
     "cuda_sampling",
+    "cuda_surfaces",
     "cuda_voxels",
     "unavailable",
 ]

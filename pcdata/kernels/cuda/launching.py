@@ -34,6 +34,10 @@ class Launcher(ABC):
         if blocks > 0:
             self._start(name, blocks, block, values_of(kernels()[name], arguments, self.device_type))
 
+    def address(self, tensor: Tensor) -> int:
+        """Return where a tensor begins on the device: for kernels that take addresses of many."""
+        return tensor.data_ptr()
+
     @abstractmethod
     def resident_blocks(self, name: str, block: int = BLOCK) -> int:
         """Return how many blocks of a kernel the device holds at once."""

@@ -69,6 +69,7 @@ def of_blocks_and_edges() -> dict[str, Any]:
 EXAMPLES: dict[str, Callable[[], dict[str, Any]]] = {
     "touched_blocks": lambda: {"view": view(0), "grid": GRID},
     "find_blocks": of_blocks_and_keys,
+    "locate_views": lambda: {"blocks": blocks(), "views": [view(0), view(3), view(4)], "grid": GRID},
     "integrate_view": of_blocks_and_view,
     "find_crossings": lambda: {"blocks": blocks(), "grid": GRID, "edges": True},
     "find_triangles": of_blocks_and_edges,
@@ -85,7 +86,7 @@ def state(value: Any) -> list[Tensor]:
         planes = [plane[: len(value)] for chunk in value.chunks for plane in chunk.values()]
         assert len(value.chunks) == 1
         return [value.keys, *planes]
-    if isinstance(value, tuple):
+    if isinstance(value, (tuple, list)):
         return [tensor for one in value for tensor in state(one)]
     if is_dataclass(value):
         return [tensor for field in fields(value) for tensor in state(getattr(value, field.name))]
@@ -153,6 +154,14 @@ def test_wrong_arguments_are_refused_by_name_before_any_backend(name):
         refused("view", replace(good["view"], depth=good["view"].depth.double()), DTypeError)
         refused("view", replace(good["view"], color=good["view"].color[1:]), ShapeError)
         refused("view", replace(good["view"], label=good["view"].label.to("meta")), DeviceError)
+    if "views" in good:
+        first, second, third = good["views"]
+        refused("views", [], DTypeError)
+        refused("views", first, DTypeError)
+        refused("views", [first, replace(second, depth=second.depth.double()), third], DTypeError)
+        refused("views", [first, replace(second, world_from_camera=second.world_from_camera[0]), third], ShapeError)
+        elsewhere = {name: getattr(second, name).to("meta") for name in ("depth", "rays", "weight", "color", "label")}
+        refused("views", [first, replace(second, **elsewhere), third], DeviceError)
     if "blocks" in good:
         for key in contract.tensors:
             with pytest.raises(DeviceError, match=rf"^{name}: .*meta"):

@@ -94,6 +94,9 @@ class Harness(launching.Launcher):
         self.recordings.append(recording)
         return result, recording.replay
 
+    def address(self, tensor: Tensor) -> int:
+        return super().address(on_host(tensor))
+
     def launch(self, name: str, threads: int, *arguments: Any, block: int = launching.BLOCK) -> None:
         super().launch(name, threads, *map(on_host, arguments), block=block)
 

@@ -10,6 +10,8 @@ from pcdata.contracts.dispatch import INNER, OPERATIONS
 from tests import pretend_device
 from tests.factories import assert_same
 from tests.functional.test_op_contract import EXAMPLES, call, clouds_of, packed
+from tests.functional.tsdf.test_step_contract import EXAMPLES as FUSION_STEPS
+from tests.functional.tsdf.test_step_contract import call as call_step
 from tests.kernels.cuda import harness
 from tests.kernels.cuda.inner_calls import CALLS, on_image
 
@@ -87,6 +89,8 @@ def test_every_kernel_is_run_by_some_operation():
         ):
             operation(**on_image(), **{count: k}, backend=harness.BACKEND)
     F.radius_outlier_mask(**on_image(), backend=harness.BACKEND)
+    for name, arguments in FUSION_STEPS.items():
+        call_step(name, arguments(), harness.BACKEND)
     F.knn(torch.rand(1100, 3), k=1, backend=harness.BACKEND)  # parents of leaves
     F.statistical_outlier_mask(torch.rand(90, 3), num_neighbors=40, backend=harness.BACKEND)
     F.estimate_normals(torch.rand(90, 3), max_neighbors=40, backend=harness.BACKEND)

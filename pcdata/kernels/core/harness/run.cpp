@@ -36,6 +36,29 @@ std::map<std::string, Kernel>& kernels() {
   return all;
 }
 
+// Stacks of fibers that have ended, for those to come: new memory would have to be cleared page by page.
+std::vector<std::unique_ptr<char[]>>& spare_stacks() {
+  static std::vector<std::unique_ptr<char[]>> stacks;
+  return stacks;
+}
+
+std::unique_ptr<char[]> take_stack() {
+  auto& spare = spare_stacks();
+  if (spare.empty()) return std::unique_ptr<char[]>(new char[kStack]);
+  auto stack = std::move(spare.back());
+  spare.pop_back();
+  return stack;
+}
+
+void give_back(std::unique_ptr<char[]> stack) {
+#if defined(__SANITIZE_ADDRESS__)
+  stack.reset();  // what is forbidden to touch on it would stay so
+#else
+  constexpr std::size_t kMost = 1 << 11;
+  if (spare_stacks().size() < kMost) spare_stacks().push_back(std::move(stack));
+#endif
+}
+
 // Where a number of fibers wait for one another.
 struct Meeting {
   int expected = 0;
@@ -137,7 +160,7 @@ class Group {
     here = &fiber.here;
     ended_ = false;
     if (!fiber.stack) {
-      fiber.stack.reset(new char[kStack]);
+      fiber.stack = take_stack();
       getcontext(&fiber.context);
       fiber.context.uc_stack.ss_sp = fiber.stack.get();
       fiber.context.uc_stack.ss_size = kStack;
@@ -151,7 +174,7 @@ class Group {
 #if defined(__SANITIZE_ADDRESS__)
     __sanitizer_finish_switch_fiber(own_fake_stack_, nullptr, nullptr);
 #endif
-    if (ended_) fiber.stack.reset();
+    if (ended_) give_back(std::move(fiber.stack));
   }
 
   void leave(Fiber& fiber, bool for_good) {

@@ -1,7 +1,7 @@
 // Finding the rows of blocks by their keys, and packing colors as voxels store them.
 #include <algorithm>
 
-#include "pc/math/voxel.hpp"
+#include "pc/math/voxel_block.hpp"
 #include "pc/threads.hpp"
 
 namespace pc::tsdf {
@@ -15,7 +15,7 @@ struct RowTable {
 
   int64_t first(int64_t key) const {
     const int shift = 64 - __builtin_ctzll(static_cast<uint64_t>(num_slots));
-    return static_cast<int64_t>(math::PackedVoxel::mixed(static_cast<uint64_t>(key)) >> shift);
+    return math::first_place(key, shift);
   }
   void add(int64_t row) {
     int64_t at = first(keys[row]);

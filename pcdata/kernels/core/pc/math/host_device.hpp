@@ -11,6 +11,7 @@
 #if defined(__CUDACC_RTC__)
 namespace pc {
 using uint8_t = unsigned char;
+using int16_t = short;
 using int32_t = int;
 using int64_t = long long;
 using uint32_t = unsigned int;

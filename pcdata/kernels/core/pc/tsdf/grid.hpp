@@ -8,12 +8,13 @@
 
 namespace pc::tsdf {
 
-constexpr int kEdge = 8, kVoxels = 512;  // of a block
-constexpr int kSlab = kEdge * kEdge;     // voxels of one z
-constexpr float kTsdfScale = 32767, kMaxWeight = 32767;
-
 using math::BlockPlace;
 using math::kBlocksPerSide;
+using math::kEdge;
+using math::kMaxWeight;
+using math::kSlab;
+using math::kTsdfScale;
+using math::kVoxels;
 
 // One plane of all blocks: chunk by chunk, null where the volume has no such plane.
 template <class T>
