@@ -1,5 +1,8 @@
 """Time every depth filter on one thread on a 1280x720 frame, next to OpenCV's nearest operator in the same run.
 
+And the chain of four over a stream, with one thread and with one per core: percentiles of the time on the clock, which
+other work on the machine lengthens, and of the processor's.
+
     PCDATA_TEST_DATA=... python benchmarks/depth_filters.py     # prints the table, writes results/depth_filters.json
 
 Method: ours and OpenCV's run in turn; each runs once to warm up, then ``--repeats`` times, a peer that takes longer
@@ -36,6 +39,7 @@ from pcdata.synthetic import tabletop
 
 SIZE = (720, 1280)
 BUDGET_MS = 1000 / 30
+_WARM_UP = 50  # frames
 _ONCE_AFTER = 1.0  # seconds: slower peers are timed once
 
 
@@ -65,6 +69,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--repeats", type=int, default=9)
     parser.add_argument("--only", default="", help="run only filters whose name contains this")
+    parser.add_argument("--frames", type=int, default=2000, help="of each stream")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
@@ -80,10 +85,11 @@ def main() -> None:
         for r in rows
     ]
     print(text_table(header, table))
+    streams = [] if arguments.only else list(stream_rows(frame, arguments.frames))
     slow = [row.filter for row in rows if row.pcdata_ms > BUDGET_MS]
     print(f"slower than 30 frames a second: {', '.join(slow) or 'none'}")
     if not arguments.only:
-        write(rows, name, arguments.repeats)
+        write(rows, streams, name, arguments.repeats)
 
 
 def load_frame() -> tuple[DepthFrame, str]:
@@ -216,7 +222,40 @@ def timed(body: Callable[[], Any], seconds: list[float]) -> None:
     seconds.append(time.process_time() - started)
 
 
-def write(rows: list[Row], name: str, repeats: int) -> None:
+@dataclass
+class StreamRow:
+    chain: str
+    threads: int
+    frames: int
+    p50_ms: float  # on the clock
+    p99_ms: float
+    processor_p50_ms: float  # of all threads
+    processor_p99_ms: float
+
+
+def stream_rows(frame: DepthFrame, count: int) -> Iterator[StreamRow]:
+    """Send a frame through the chain again and again, as a camera would."""
+    for threads in dict.fromkeys((1, os.cpu_count() or 1)):
+        torch.set_num_threads(threads)
+        for size in (SIZE, (480, 640)):
+            case = chain_case(frame if size == SIZE else pcdata.ResizeDepth(size=size)(frame))
+            clock, processor = [], []
+            for _ in range(count + _WARM_UP):
+                started = time.perf_counter()
+                timed(case.ours, processor)
+                clock.append(time.perf_counter() - started)
+            found = [
+                1000 * float(np.percentile(seconds[_WARM_UP:], percent))
+                for seconds in (clock, processor)
+                for percent in (50, 99)
+            ]
+            row = StreamRow(case.filter, threads, count, *found)
+            print(f"{row.chain}, {threads} threads: p50 {row.p50_ms:.1f} ms, p99 {row.p99_ms:.1f} ms", flush=True)
+            yield row
+    torch.set_num_threads(1)
+
+
+def write(rows: list[Row], streams: list[StreamRow], name: str, repeats: int) -> None:
     result = {
         "frame": name,
         "repeats": repeats,
@@ -224,6 +263,7 @@ def write(rows: list[Row], name: str, repeats: int) -> None:
         "machine": {"cores": os.cpu_count(), "threads": torch.get_num_threads(), "processor": platform.machine()},
         "versions": {"pcdata": pcdata.__version__, "torch": torch.__version__, "opencv": cv2.__version__},
         "rows": [asdict(row) for row in rows],
+        "streams": [asdict(row) for row in streams],
     }
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "depth_filters.json").write_text(json.dumps(result, indent=1) + "\n")

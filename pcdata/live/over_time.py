@@ -11,6 +11,7 @@ from pcdata.functional.depth.temporal import TemporalState
 from pcdata.io.sources.averaged import averaged_frame
 from pcdata.io.sources.still_camera import check_still_camera
 from pcdata.io.sources.temporal import TemporalFilterDepth
+from pcdata.live.kept_memory import keep_freed_memory
 from pcdata.structures import DepthFrame
 
 
@@ -24,6 +25,7 @@ class OverTime:
     def __init__(self, *, max_gap: float) -> None:
         if not max_gap > 0:
             raise ConfigError(f"{type(self).__name__}: max_gap must be above 0 seconds, got {max_gap!r}")
+        keep_freed_memory()
         self.max_gap = max_gap
         self.resets = 0
         self._first: DepthFrame | None = None

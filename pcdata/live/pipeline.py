@@ -29,6 +29,7 @@ from pcdata.live.arrays import ArrayReader
 from pcdata.live.faults import Fault, LiveResult, StalledError
 from pcdata.live.first_frame import check_like, has_readings, same_pixels
 from pcdata.live.fixed_frames import FixedFrames, Seen
+from pcdata.live.kept_memory import keep_freed_memory
 from pcdata.live.latency import Histogram
 from pcdata.live.latest_frame import LatestFrame
 from pcdata.live.over_time import OverTime
@@ -105,6 +106,7 @@ class LivePipeline:
             raise DTypeError(
                 f"LivePipeline: before must be a LiveTemporalFilter or a LiveAverage, got {type(before).__name__}"
             )
+        keep_freed_memory()
         self.before, self.max_age = before, max_age
         self._like, self._seed, self._same_pixels = like, seed, same_pixels
         self._warm_planes = warm_planes

@@ -174,30 +174,41 @@ struct Memory {
   Memory from(int64_t at) const { return {last + at, history + at, new_last + at, new_history + at}; }
 };
 
-// Up to kSome pixels; what lies beyond them is not looked at.
+// kSome pixels.
 template <bool kDivides>
-void filter_over_time(const float* values, const Memory& memory, int count, const Rule& rule,
-                      const Persistence& persistence, const Reading<kDivides>& reading, float* filtered) {
-  alignas(64) float own[kSome] = {}, last[kSome] = {};
-  alignas(64) int32_t history[kSome] = {};
-  std::copy_n(values, count, own);
-  std::copy_n(memory.last, count, last);
-  for (int i = 0; i < count; ++i) history[i] = memory.history[i];
+void filter_some(const float* values, const Memory& memory, const Rule& rule, const Persistence& persistence,
+                 const Reading<kDivides>& reading, float* filtered) {
+  alignas(64) int32_t history[kSome];
+  for (int i = 0; i < kSome; ++i) history[i] = memory.history[i];
   const FloatRegister zero{}, keep = zero + rule.keep, delta = zero + rule.delta;
-  for (int i = 0; i < count; i += kLanes) {
-    const FloatRegister now = reading(load<FloatRegister>(own + i)), before = load<FloatRegister>(last + i);
+  for (int i = 0; i < kSome; i += kLanes) {
+    const FloatRegister now = reading(load<FloatRegister>(values + i)), before = load<FloatRegister>(memory.last + i);
     const Int32Register past = load<Int32Register>(history + i), one = Int32Register{} + 1, shifted = past << 1;
     const RegisterMask valid = less(zero, now), known = less(zero, before);
     const RegisterMask steady = valid & known & less(magnitude(now - before), delta);
     const FloatRegister mixed = select(steady, now + keep * (before - now), now);
     const RegisterMask bridged = known & unequal(persistence.bits(past), Int32Register{});
-    store(own + i, reading(select(valid, mixed, select(bridged, before, zero))));
-    store(last + i, select(valid, mixed, before));
+    store(filtered + i, reading(select(valid, mixed, select(bridged, before, zero))));
+    store(memory.new_last + i, select(valid, mixed, before));
     store(history + i, select(valid, select(steady, shifted, Int32Register{}) | one, shifted));
   }
-  std::copy_n(own, count, filtered);
-  std::copy_n(last, count, memory.new_last);
-  for (int i = 0; i < count; ++i) memory.new_history[i] = static_cast<uint8_t>(history[i]);
+  for (int i = 0; i < kSome; ++i) memory.new_history[i] = static_cast<uint8_t>(history[i]);
+}
+
+// Up to kSome pixels; what lies beyond them is not looked at.
+template <bool kDivides>
+void filter_over_time(const float* values, const Memory& memory, int count, const Rule& rule,
+                      const Persistence& persistence, const Reading<kDivides>& reading, float* filtered) {
+  if (count == kSome) return filter_some(values, memory, rule, persistence, reading, filtered);
+  float own[kSome] = {}, last[kSome] = {}, new_own[kSome], new_last[kSome];
+  uint8_t history[kSome] = {}, new_history[kSome];
+  std::copy_n(values, count, own);
+  std::copy_n(memory.last, count, last);
+  std::copy_n(memory.history, count, history);
+  filter_some(own, {last, history, new_last, new_history}, rule, persistence, reading, new_own);
+  std::copy_n(new_own, count, filtered);
+  std::copy_n(new_last, count, memory.new_last);
+  std::copy_n(new_history, count, memory.new_history);
 }
 
 template <bool kDivides>

@@ -196,17 +196,24 @@ class Layers {
 
   // The first layer: holes beside a reading.
   void find_first() {
+    constexpr int64_t kBlock = 64;
     const int64_t at_once = images_.rows_at_once();
     std::vector<std::vector<Place>> found(static_cast<size_t>((images_.rows() + at_once - 1) / at_once));
     parallel_for(context_, images_.rows(), at_once, [&](int64_t begin, int64_t end, int64_t) {
       std::vector<Place>& mine = found[static_cast<size_t>(begin / at_once)];
       for (int64_t row = begin; row < end; ++row) {
         const int64_t start = padded_row(row), width = images_.width;
-        for (int64_t u = 0; u < width; ++u) {
-          const float* own = values_ + start + u;
-          if (*own != 0) continue;
-          const bool beside = (own[-1] > 0) | (own[1] > 0) | (own[-stride_] > 0) | (own[stride_] > 0);
-          if (beside) mine.push_back({static_cast<int32_t>(row * width + u), static_cast<int32_t>(start + u)});
+        for (int64_t block = 0; block < width; block += kBlock) {
+          const int64_t end_of_block = std::min(block + kBlock, width);
+          int32_t holes = 0;  // most blocks have none
+          for (int64_t u = block; u < end_of_block; ++u) holes += values_[start + u] == 0;
+          if (holes == 0) continue;
+          for (int64_t u = block; u < end_of_block; ++u) {
+            const float* own = values_ + start + u;
+            if (*own != 0) continue;
+            const bool beside = (own[-1] > 0) | (own[1] > 0) | (own[-stride_] > 0) | (own[stride_] > 0);
+            if (beside) mine.push_back({static_cast<int32_t>(row * width + u), static_cast<int32_t>(start + u)});
+          }
         }
       }
     });
