@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import accumulate, pairwise
 from typing import Any
 
 import torch
@@ -85,13 +86,12 @@ def draw_planes(points: Tensor, ptr: Tensor, triples: Tensor, which: Tensor) -> 
 @kernel("bound_runs", "cpu")
 def bound_runs(points: Tensor, ptr: Tensor) -> tuple[Tensor, ...]:
     """Look at 64 points that follow each other at a time, where that is worth it: in large clouds."""
-    counts = counts_from_ptr(ptr)
-    if int(counts.max()) <= _SMALL_CLOUD:
+    counts = [stop - start for start, stop in pairwise(ptr.tolist())]
+    if max(counts, default=0) <= _SMALL_CLOUD:
         return ()
-    runs = torch.where(counts > _SMALL_CLOUD, (counts + (_RUN - 1)) // _RUN, 0)
-    run_ptr = ptr_from_counts((runs + (_RUNS_AT_ONCE - 1)) // _RUNS_AT_ONCE * _RUNS_AT_ONCE)
-    num_runs = int(run_ptr[-1])
-    facts = room((8, num_runs), torch.float32)
+    groups = [-(-count // (_RUN * _RUNS_AT_ONCE)) if count > _SMALL_CLOUD else 0 for count in counts]
+    run_ptr = numbers(accumulate((_RUNS_AT_ONCE * some for some in groups), initial=0))
+    facts = room((8, _RUNS_AT_ONCE * sum(groups)), torch.float32)
     call("pc_bound_runs", points, ptr, len(counts), run_ptr, facts)
     return run_ptr, facts
 

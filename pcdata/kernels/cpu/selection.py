@@ -81,7 +81,7 @@ def points_in_cells(points: Tensor, chosen: Tensor, axes: Tensor, low: Tensor, s
 
 @kernel("outline_rows", "cpu")
 def outline_rows(points: Tensor, chosen: Tensor, plane: Tensor, axes: Tensor) -> tuple[Tensor, float]:
-    """Leave out what is well inside of an octagon, in the pass that sums squares; few points are left."""
+    """Leave out what is well inside of a polygon, in the pass that sums squares; few points are left."""
     points, rows = points.contiguous(), room(len(points), torch.int64)
     number, squares = room(1, torch.int64), room(1, torch.float64)
     call("pc_outline_points", points, chosen, len(points), plane.contiguous(), axes, rows, number, squares)

@@ -1,4 +1,7 @@
 // Points near a plane as seen along its normal: which lie in chosen cells of it, and which may be on their outline.
+#include <cmath>
+#include <limits>
+
 #include "pc/memory.hpp"
 #include "pc/planes/runs.hpp"
 #include "pc/threads.hpp"
@@ -32,60 +35,104 @@ struct Cells {
   }
 };
 
-// An octagon of points of an outline, and which points are well inside of it. Source: Akl & Toussaint, A fast convex
+// Polygons of points of an outline, and which points are well inside of them. Source: Akl & Toussaint, A fast convex
 // hull algorithm, Information Processing Letters 7(5), 1978.
-class Octagon {
+class Outline {
  public:
-  Octagon(const float* points, const uint8_t* chosen, int64_t count, const double* axes) : u_(axes), v_(axes + 3) {
+  Outline(const float* points, const uint8_t* chosen, int64_t count, const double* axes, ScratchFrame& scratch)
+      : u_(axes), v_(axes + 3) {
     constexpr int64_t kLooked = 8192;  // points: some of the outline are as good as all
-    constexpr double kDirections[8][2] = {{1, 0}, {1, 1}, {0, 1}, {-1, 1}, {-1, 0}, {-1, -1}, {0, -1}, {1, -1}};
-    double most[8], x[8] = {}, y[8] = {};
-    std::fill_n(most, 8, -std::numeric_limits<double>::infinity());
-    const int64_t step = std::max<int64_t>(1, count / kLooked);
+    const int64_t step = std::max<int64_t>(1, count / kLooked), most = (count + step - 1) / step + kLanes;
+    float *u = scratch.take<float>(most), *v = scratch.take<float>(most);
+    int32_t* row = scratch.take<int32_t>(most);
+    int64_t some = 0;
     for (int64_t i = 0; i < count; i += step) {
       if (!chosen[i]) continue;
       const float* p = points + 3 * i;
-      const double u = (p[0] * axes[0] + p[1] * axes[1]) + p[2] * axes[2];
-      const double v = (p[0] * axes[3] + p[1] * axes[4]) + p[2] * axes[5];
-      for (int d = 0; d < 8; ++d) {
-        const double along = kDirections[d][0] * u + kDirections[d][1] * v;
-        if (along > most[d]) most[d] = along, x[d] = u, y[d] = v;
-      }
+      u[some] = (p[0] * u_.x + p[1] * u_.y) + p[2] * u_.z;
+      v[some] = (p[0] * v_.x + p[1] * v_.y) + p[2] * v_.z;
+      row[some++] = static_cast<int32_t>(i / step);
     }
-    const double wide = most[0] + most[4], high = most[2] + most[6], size = wide * wide + high * high;
+    if (some == 0) return;
+    for (int64_t i = some; i % kLanes != 0; ++i) u[i] = u[0], v[i] = v[0], row[i] = row[0];
+    double x[kCorners], y[kCorners];
+    for (int k = 0; k < kCorners; ++k) {
+      constexpr double kTurn = 6.283185307179586 / kCorners;
+      const float* p = points + 3 * step * farthest(u, v, row, some, std::cos(k * kTurn), std::sin(k * kTurn));
+      x[k] = (p[0] * axes[0] + p[1] * axes[1]) + p[2] * axes[2];
+      y[k] = (p[0] * axes[3] + p[1] * axes[4]) + p[2] * axes[5];
+    }
+    const double wide = x[0] - x[kCorners / 2], high = y[kCorners / 4] - y[3 * kCorners / 4];
+    const double size = wide * wide + high * high;
     // Above what rounding of floats does, beside what near_outline leaves to doubles.
     if (!(size > 0 && size < kHuge)) return;
-    for (int d = 0; d < 8; ++d) {
-      const double ex = x[(d + 1) % 8] - x[d], ey = y[(d + 1) % 8] - y[d];
-      if (ex == 0 && ey == 0) continue;
-      const double least = 1e-6 * size, reach = std::fabs(x[d]) + std::fabs(y[d]);
-      const double doubt = 4 * kRounding * (std::fabs(ex) + std::fabs(ey));
-      edges_[num_edges_++] = {static_cast<float>(x[d]),  static_cast<float>(y[d]),
-                              static_cast<float>(ex),    static_cast<float>(ey),
-                              static_cast<float>(doubt), static_cast<float>(least + doubt * reach)};
-    }
+    coarse_ = Polygon(x, y, kCoarse, size);
+    fine_ = Polygon(x, y, 1, size);
   }
 
-  RegisterMask holds(const FloatRegister& x, const FloatRegister& y, const FloatRegister& z) const {
+  // Lanes of points that are well inside; all others, and perhaps some of those, may be corners.
+  uint32_t inside(const FloatRegister& x, const FloatRegister& y, const FloatRegister& z, uint32_t asked) const {
     const FloatRegister u = u_.along(x, y, z), v = v_.along(x, y, z);
     const FloatRegister size = (magnitude(x) + magnitude(y)) + magnitude(z);
-    RegisterMask inside = less(size, FloatRegister{} + (num_edges_ < 3 ? -1.0F : kHuge));
-    for (int e = 0; e < num_edges_; ++e) {
-      const Edge& edge = edges_[e];
-      const FloatRegister cross = edge.ex * (v - edge.y) - edge.ey * (u - edge.x);
-      inside = inside & less(edge.doubt * size + edge.least, cross);
-    }
-    return inside;
+    const uint32_t found = coarse_.holds(u, v, size).bits();
+    return (asked & ~found) == 0 ? found : found | fine_.holds(u, v, size).bits();
   }
 
  private:
+  static constexpr int kCorners = 32, kCoarse = 4;  // of the coarse polygon every fourth: it holds nearly all points
+
   struct Edge {
     float x, y, ex, ey, doubt, least;
   };
 
+  struct Polygon {
+    Edge edges[kCorners] = {};
+    int num_edges = 0;
+
+    Polygon() = default;
+    Polygon(const double* x, const double* y, int step, double size) {
+      for (int k = 0; k < kCorners; k += step) {
+        const int next = (k + step) % kCorners;
+        const double ex = x[next] - x[k], ey = y[next] - y[k];
+        if (ex == 0 && ey == 0) continue;
+        const double least = 1e-6 * size, reach = std::fabs(x[k]) + std::fabs(y[k]);
+        const double doubt = 4 * kRounding * (std::fabs(ex) + std::fabs(ey));
+        edges[num_edges++] = {static_cast<float>(x[k]),  static_cast<float>(y[k]),
+                              static_cast<float>(ex),    static_cast<float>(ey),
+                              static_cast<float>(doubt), static_cast<float>(least + doubt * reach)};
+      }
+    }
+
+    RegisterMask holds(const FloatRegister& u, const FloatRegister& v, const FloatRegister& size) const {
+      RegisterMask inside = less(size, FloatRegister{} + (num_edges < 3 ? -1.0F : kHuge));
+      for (int e = 0; e < num_edges; ++e) {
+        const Edge& edge = edges[e];
+        const FloatRegister cross = edge.ex * (v - edge.y) - edge.ey * (u - edge.x);
+        inside = inside & less(edge.doubt * size + edge.least, cross);
+      }
+      return inside;
+    }
+  };
+
+  // The row of one of the points farthest along a direction.
+  static int64_t farthest(const float* u, const float* v, const int32_t* row, int64_t count, double du, double dv) {
+    const auto right = static_cast<float>(du), up = static_cast<float>(dv);
+    FloatRegister most = FloatRegister{} - std::numeric_limits<float>::infinity();
+    auto best = load<Int32Register>(row);
+    for (int64_t i = 0; i < count; i += kLanes) {
+      const FloatRegister along = right * load<FloatRegister>(u + i) + up * load<FloatRegister>(v + i);
+      const RegisterMask farther = less(most, along);
+      best = select(farther, load<Int32Register>(row + i), best);
+      most = select(farther, along, most);
+    }
+    int lane = 0;
+    for (int i = 1; i < kLanes; ++i)
+      if (most[i] > most[lane]) lane = i;
+    return best[lane];
+  }
+
   Axis u_, v_;
-  Edge edges_[8] = {};
-  int num_edges_ = 0;
+  Polygon coarse_, fine_;
 };
 
 // One bit for each of up to 64 bytes of 0 and 1.
@@ -126,7 +173,8 @@ PC_EXPORT int32_t pc_outline_points(const pc_context* context, const float* poin
   using namespace pc;
   using namespace pc::planes;
   return guarded([&] {
-    const Octagon octagon(points, chosen, count, axes);
+    ScratchFrame scratch;
+    const Outline outline(points, chosen, count, axes, scratch);
     const int64_t num_runs = (count + kRun - 1) / kRun, num_pieces = (num_runs + kPieceRuns - 1) / kPieceRuns;
     std::vector<std::vector<int64_t>> found(static_cast<size_t>(num_pieces));
     std::vector<double> sums(static_cast<size_t>(num_pieces));
@@ -139,7 +187,8 @@ PC_EXPORT int32_t pc_outline_points(const pc_context* context, const float* poin
           const RunPoints own(points, count, run);
           uint64_t inside = 0;
           own.each([&](const FloatRegister& x, const FloatRegister& y, const FloatRegister& z, int i) {
-            inside |= static_cast<uint64_t>(octagon.holds(x, y, z).bits()) << i;
+            const auto asked = static_cast<uint32_t>(mine >> i) & all_lanes().bits();
+            inside |= static_cast<uint64_t>(outline.inside(x, y, z, asked)) << i;
           });
           for (uint64_t bits = mine & ~inside; bits != 0; bits &= bits - 1)
             found[static_cast<size_t>(piece)].push_back(kRun * run + __builtin_ctzll(bits));
