@@ -424,13 +424,12 @@ def _clouds_between(points: Tensor, ptr: Tensor, first: int, stop: int) -> tuple
 def face_planes(planes: Tensor, ups: Tensor | None, distance: float) -> Tensor:
     """Turn the normals along ``up``, else toward an origin off the plane, else the largest component is positive."""
     normals, offset = planes[:, :3], planes[:, 3]
-    sign = torch.where(through_origin(planes, distance), 0.0, offset).sign()
-    if ups is not None:
-        along_up = torch.linalg.vecdot(normals, ups).sign()
-        sign = torch.where(along_up == 0, sign, along_up)
-    if not bool((sign != 0).all()):
-        largest = normals.gather(1, normals.abs().argmax(1, keepdim=True)).squeeze(1)
-        sign = torch.where(sign == 0, largest.sign(), sign)
+    along_up = torch.zeros_like(offset) if ups is None else torch.linalg.vecdot(normals, ups)
+    toward_origin = torch.where(through_origin(planes, distance), 0.0, offset)
+    largest = normals.gather(1, normals.abs().argmax(1, keepdim=True)).squeeze(1)
+    sign = torch.zeros_like(offset)
+    for deciding in (along_up, toward_origin, largest):
+        sign = torch.where(sign == 0, deciding.sign(), sign)
     return torch.where((sign < 0)[:, None], -planes, planes)
 
 

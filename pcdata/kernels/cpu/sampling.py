@@ -89,9 +89,10 @@ def bound_runs(points: Tensor, ptr: Tensor) -> tuple[Tensor, ...]:
     counts = [stop - start for start, stop in pairwise(ptr.tolist())]
     if max(counts, default=0) <= _SMALL_CLOUD:
         return ()
-    groups = [-(-count // (_RUN * _RUNS_AT_ONCE)) if count > _SMALL_CLOUD else 0 for count in counts]
-    run_ptr = numbers(accumulate((_RUNS_AT_ONCE * some for some in groups), initial=0))
-    facts = room((8, _RUNS_AT_ONCE * sum(groups)), torch.float32)
+    points_at_once = _RUN * _RUNS_AT_ONCE
+    runs = [-(-count // points_at_once) * _RUNS_AT_ONCE if count > _SMALL_CLOUD else 0 for count in counts]
+    run_ptr = torch.tensor([0, *accumulate(runs)], dtype=torch.int64, device="cpu")
+    facts = room((8, sum(runs)), torch.float32)
     call("pc_bound_runs", points, ptr, len(counts), run_ptr, facts)
     return run_ptr, facts
 
