@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import inspect
 import multiprocessing
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -29,6 +30,7 @@ from torch import Tensor
 from pcdata.contracts.arguments import Contract
 from pcdata.contracts.compiling import called_apart, is_traced
 from pcdata.contracts.numbers import Spec
+from pcdata.contracts.operators import Traced
 from pcdata.errors import BackendError, SlowBackendWarning, near_matches
 
 P = ParamSpec("P")
@@ -86,6 +88,7 @@ def op(
     gradient: bool = True,
     mutates: tuple[str, ...] = (),
     steps: tuple[Callable[..., Any], ...] = (),
+    traced: Traced | None = None,
     **specs: str | Spec,
 ) -> Callable[[Callable[P, R]], Callable[P, R]]:
     """Register the decorated reference as a public operation with a contract per argument.
@@ -97,6 +100,7 @@ def op(
         gradient: whether results carry one to the inputs; with False no body ever sees a tensor that requires one.
         mutates: arguments that it changes in place, to the same values on every backend; all others stay as they are.
         steps: inner functions that the reference calls with its ``backend``.
+        traced: how a compiler keeps it whole; None = a compiled program is cut where it calls the operation.
         specs: argument name -> contract: of tensors a string, see :mod:`pcdata.contracts.tensors`; of others a
             function, see :mod:`pcdata.contracts.numbers`.
     """
@@ -108,8 +112,8 @@ def op(
         @functools.wraps(reference)
         def public(*args: P.args, **kwargs: P.kwargs) -> R:
             if is_traced():
-                found: R = called_apart(public, *args, **kwargs)
-                return found
+                found: R | None = None if operator is None else operator(defaults, args, kwargs)
+                return called_apart(public, *args, **kwargs) if found is None else found
             arguments = contract.bind(args, kwargs)
             contract.check(arguments)
             backend = arguments.pop("backend", "auto")
@@ -126,6 +130,12 @@ def op(
                 arguments["backend"] = backend
             return body(**arguments) if body is not None else operation.reference(**arguments)
 
+        operator = None if traced is None else traced.register(name, public, gradient=gradient)
+        # Without a default: an argument that an operator takes, or None, which it cannot.
+        defaults = {
+            key: None if one.default is one.empty else one.default
+            for key, one in inspect.signature(reference).parameters.items()
+        }
         operation = OPERATIONS[name] = _Operation(
             name, reference, public, contract, gradient, mutates, tuple(step.__name__ for step in steps)
         )

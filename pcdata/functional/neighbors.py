@@ -21,6 +21,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_word, require_length
+from pcdata.contracts.operators import Traced
 from pcdata.errors import ConfigError, DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.nearest import nearest_chunks, rooted, squared_distance
@@ -52,7 +53,7 @@ def nearest_rows(
     """Find the k nearest points of its own cloud (with d < radius) for every query; padding is (N, infinity)."""
     return laid_out(
         nearest_chunks(points, ptr, k, queries=queries, queries_ptr=queries_ptr, radius=radius, backend="torch"),
-        len(points if queries is None else queries),
+        (points if queries is None else queries).shape[0],
         k,
         points.device,
     )
@@ -102,6 +103,12 @@ def checked_radius(where: str, name: str, arguments: Any) -> float | Tensor:
     return value.detach().to(device=queries.device, dtype=torch.float32)
 
 
+def _found_by(points: Tensor, queries: Tensor | None, k: int) -> tuple[Tensor, Tensor]:
+    """Return empty rows and distances like those of k neighbors."""
+    shape = (points if queries is None else queries).shape[0], k
+    return points.new_empty(shape, dtype=torch.int64), points.new_empty(shape)
+
+
 @op(
     points="N D",
     ptr="ptr N B",
@@ -111,6 +118,11 @@ def checked_radius(where: str, name: str, arguments: Any) -> float | Tensor:
     norm=functools.partial(checked_word, words=NORMS),
     grid=checked_grid,
     steps=(nearest_rows, rows_within),
+    traced=Traced(
+        "Tensor points, Tensor? ptr, int k, Tensor? queries, Tensor? queries_ptr, bool exclude_self, str norm",
+        "Tensor index, Tensor distance",
+        lambda points, k, queries, **_: _found_by(points, queries, k),
+    ),
 )
 def knn(
     points: Tensor,  # (N, D) float32
@@ -159,6 +171,15 @@ def knn(
     norm=functools.partial(checked_word, words=NORMS),
     grid=checked_grid,
     steps=(nearest_rows, rows_within),
+    traced=Traced(
+        "Tensor points, Tensor? ptr, float radius, int max_neighbors, Tensor? queries, Tensor? queries_ptr, "
+        "bool exclude_self, str norm",
+        "Tensor index, Tensor distance, Tensor count",
+        lambda points, queries, max_neighbors, **_: (
+            *_found_by(points, queries, max_neighbors),
+            points.new_empty((points if queries is None else queries).shape[0], dtype=torch.int64),
+        ),
+    ),
 )
 def ball_query(
     points: Tensor,  # (N, D) float32

@@ -17,6 +17,7 @@ from pcdata.contracts.dispatch import op
 from pcdata.contracts.host import all_finite
 from pcdata.contracts.known import FINITE, is_known
 from pcdata.contracts.numbers import checked_count, checked_length
+from pcdata.contracts.operators import Traced
 from pcdata.errors import DeviceError, DTypeError, NonFiniteError, ShapeError
 from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.nearest import nearest_chunks
@@ -35,6 +36,11 @@ def checked_reach(where: str, name: str, arguments: Mapping[str, Any]) -> float 
     grid=checked_grid,
     steps=(nearest_chunks,),
     gradient=False,
+    traced=Traced(
+        "Tensor points, Tensor? ptr, float? radius, int max_neighbors",
+        "Tensor normals",
+        lambda points, **_: points.new_empty(points.shape),
+    ),
 )
 def estimate_normals(
     points: Tensor,  # (N, 3) float32

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_count, checked_length, checked_positive
+from pcdata.contracts.operators import Traced
 from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.nearest import nearest_chunks, pair_chunks, rooted
 from pcdata.functional.radius import require_extent, squared_radius
@@ -18,6 +19,11 @@ from pcdata.functional.rows import cloud_of_rows, counts_from_ptr
 
 # Interleaved sums: as many as threads of a GPU that work together.
 _RUNS = 1024
+
+
+def _mask_of(points: Tensor) -> Tensor:
+    """Return an empty mask like the result."""
+    return points.new_empty(points.shape[0], dtype=torch.bool)
 
 
 @op(
@@ -28,6 +34,11 @@ _RUNS = 1024
     grid=checked_grid,
     steps=(nearest_chunks,),
     gradient=False,
+    traced=Traced(
+        "Tensor points, Tensor? ptr, int num_neighbors, float std_ratio",
+        "Tensor outlier",
+        lambda points, **_: _mask_of(points),
+    ),
 )
 def statistical_outlier_mask(
     points: Tensor,  # (N, 3) float32
@@ -82,7 +93,19 @@ def _interleaved_sum(values: Tensor, ptr: Tensor) -> Tensor:
     return runs[:, 0]
 
 
-@op(points="N 3", ptr="ptr N B", min_neighbors=checked_count, radius=checked_length, grid=checked_grid, gradient=False)
+@op(
+    points="N 3",
+    ptr="ptr N B",
+    min_neighbors=checked_count,
+    radius=checked_length,
+    grid=checked_grid,
+    gradient=False,
+    traced=Traced(
+        "Tensor points, Tensor? ptr, int min_neighbors, float radius",
+        "Tensor outlier",
+        lambda points, **_: _mask_of(points),
+    ),
+)
 def radius_outlier_mask(
     points: Tensor,  # (N, 3) float32
     ptr: Tensor | None = None,  # (B+1,); None = one cloud

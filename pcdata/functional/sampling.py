@@ -11,6 +11,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_counts, checked_fraction, counts_per_cloud, require_rows
 from pcdata.contracts.on_host import bounds_of, counts_of, on_host, uploaded
+from pcdata.contracts.operators import Traced
 from pcdata.errors import ConfigError, OutOfRangeError, ShapeError
 from pcdata.functional.neighbors import knn
 from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_from_counts, segment_sum
@@ -65,6 +66,14 @@ def _wanted_counts(where: str, num_samples: Any, ratio: Any) -> list[int]:
     ratio=checked_ratio,
     steps=(farthest_rows,),
     gradient=False,
+    traced=Traced(
+        "Tensor points, Tensor? ptr, int num_samples, Tensor? start, Tensor? seeds",
+        "Tensor index, Tensor picked_ptr",
+        lambda points, ptr, num_samples, **_: (
+            points.new_empty((1 if ptr is None else ptr.shape[0] - 1) * num_samples, dtype=torch.int64),
+            points.new_empty(2 if ptr is None else ptr.shape[0], dtype=torch.int64),
+        ),
+    ),
 )
 def farthest_point_sample(
     points: Tensor,  # (N, D) float32
