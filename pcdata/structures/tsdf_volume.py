@@ -166,8 +166,8 @@ class TSDFVolume:
                 f"TSDFVolume: every frame needs the images of the first, which had colors: {'color' in had}, labels: "
                 f"{'label' in had}; {frame!r} has colors: {'color' in has}, labels: {'label' in has}"
             )
-        if frame.labels is not None and not tsdf.fit_labels(frame.labels):
-            raise CaptureError("TSDFVolume: labels must fit 32 bits; number the objects anew")
+        if frame.labels is not None and frame.device.type == "cpu":
+            tsdf.check_labels(frame.labels)
 
     def _view(self, frame: DepthFrame, index: int) -> tsdf.FusionView:
         camera = frame.camera
@@ -180,6 +180,11 @@ class TSDFVolume:
         if lens is not None:
             check_rays("TSDFVolume", rays[None], (depth > 0)[None])
         assert frame.world_from_camera is not None
+        label = unfit = None
+        if frame.labels is not None:
+            label = tsdf.pack_labels(frame.labels[index])
+            if frame.device.type != "cpu":  # to know now, the host would have to wait
+                unfit = (label != frame.labels[index]).any().reshape(1)
         return tsdf.FusionView(
             depth=depth,
             rays=directions,
@@ -188,7 +193,8 @@ class TSDFVolume:
             world_from_camera=on_host(frame.world_from_camera)[index],
             weight=tsdf.weight_image(depth, rays, self.weighting),
             color=None if frame.colors is None else tsdf.pack_colors(frame.colors[index], backend=self.backend),
-            label=None if frame.labels is None else tsdf.pack_labels(frame.labels[index]),
+            label=label,
+            unfit=unfit,
         )
 
     def _rays(self, k: Tensor, lens: Tensor | None, frame: DepthFrame) -> tuple[Tensor, Tensor]:

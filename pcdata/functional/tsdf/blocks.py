@@ -81,8 +81,9 @@ class VoxelBlocks:
     planes: Planes
     device: torch.device
     chunks: list[Chunk] = field(default_factory=list)
-    table: Tensor | None = None  # of hashed keys; the compiled core makes it and keeps it up to date
+    table: Tensor | None = None  # of hashed keys; kernels make it and keep it up to date
     in_table: int = 0  # rows that the table has
+    addresses: Tensor | None = None  # of the chunks; kernels of a GPU make it
     _count: int = field(default=0, init=False)
     _room: Tensor = field(init=False, repr=False)  # for keys; doubled when full
     _sorted: tuple[Tensor, Tensor] = field(init=False, repr=False)  # keys, rows of the blocks there were at some time

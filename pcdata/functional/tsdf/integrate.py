@@ -16,7 +16,7 @@ from pcdata.contracts.dispatch import op
 from pcdata.contracts.on_host import on_host, uploaded
 from pcdata.functional.tsdf.blocks import BLOCKS, MAX_WEIGHT, TSDF_SCALE, Chunk, VoxelBlocks
 from pcdata.functional.tsdf.grid import GRID, VoxelGrid, pack_keys, unpack_keys, voxel_offsets
-from pcdata.functional.tsdf.views import VIEW, VIEWS, FusionView
+from pcdata.functional.tsdf.views import VIEW, VIEWS, FusionView, refuse_labels
 from pcdata.geometry.lens import distort_normalized
 from pcdata.geometry.lens_models import is_plain
 from pcdata.threads import at_once
@@ -60,7 +60,12 @@ def locate_views(
     """Return the rows (N,) of the blocks that each view touches, in key order, and the sorted keys (M,) of new ones.
 
     A missing block has the row that it gets when these keys are added next.
+
+    Raises:
+        CaptureError: a label did not fit the 32 bits of a voxel.
+        UnitError: a block lies more than 2^20 blocks from the origin.
     """
+    refuse_labels(any(view.unfit is not None and bool(view.unfit) for view in views))
     touched = [touched_blocks(view, grid, backend="torch") for view in views]
     found = [find_blocks(blocks, keys, backend="torch") for keys in touched]
     return located(blocks, touched, found)

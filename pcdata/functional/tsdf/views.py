@@ -12,6 +12,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.fields import Fields, Several
 from pcdata.contracts.on_host import on_host
+from pcdata.errors import CaptureError
 from pcdata.functional.tsdf.blocks import COLOR_SCALE
 from pcdata.geometry import rigid
 from pcdata.geometry.lens import fold_radius
@@ -35,6 +36,7 @@ class FusionView:
     weight: Tensor | None = None  # (H, W) int32 at least 1; None = 1 everywhere
     color: Tensor | None = None  # (H, W) int32: r | g << 10 | b << 20, in steps of a stored color
     label: Tensor | None = None  # (H, W) int32
+    unfit: Tensor | None = None  # (1,) bool: whether a label does not fit, not yet read; None = all do
 
     @property
     def camera_from_world(self) -> Tensor:
@@ -54,6 +56,7 @@ _TENSORS = {
     "weight": "H W : int32",
     "color": "H W : int32",
     "label": "H W : int32",
+    "unfit": "1 : bool",
 }
 # The spec of a view, and of several: what kernels read.
 VIEW = Fields(FusionView, numbers=_NUMBERS, **_TENSORS)
@@ -71,13 +74,20 @@ def pack_colors(
     return r | (g << 10) | (b << 20)
 
 
-def fit_labels(labels: Tensor) -> bool:
-    """Say whether int64 labels fit the 32 bits of a voxel."""
-    if labels.device.type == "cpu":
-        found = labels.numpy()  # see pcdata.contracts.tensors on NumPy
-        return int(found.min()) >= -(2**31) and int(found.max()) < 2**31
-    low, high = torch.stack(labels.aminmax()).tolist()
-    return bool(low >= -(2**31) and high < 2**31)
+def check_labels(labels: Tensor) -> None:
+    """Hold int64 labels of the host to the 32 bits of a voxel.
+
+    Raises:
+        CaptureError: one does not fit.
+    """
+    found = labels.numpy()  # see pcdata.contracts.tensors on NumPy
+    refuse_labels(int(found.min()) < -(2**31) or int(found.max()) >= 2**31)
+
+
+def refuse_labels(lack: bool) -> None:
+    """Refuse labels if some did not fit."""
+    if lack:
+        raise CaptureError("TSDFVolume: labels must fit 32 bits; number the objects anew")
 
 
 def pack_labels(labels: Tensor) -> Tensor:

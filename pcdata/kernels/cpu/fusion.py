@@ -14,7 +14,7 @@ from pcdata.functional.tsdf import integrate, marching
 from pcdata.functional.tsdf.blocks import MAX_WEIGHT, TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.surface import Crossings
-from pcdata.functional.tsdf.views import FusionView
+from pcdata.functional.tsdf.views import FusionView, refuse_labels
 from pcdata.geometry.lens_models import is_plain
 from pcdata.kernels.cpu.native import address, call, numbers, room, room_for
 
@@ -42,6 +42,7 @@ def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
 @kernel("locate_views", "cpu")
 def locate_views(blocks: VoxelBlocks, views: Sequence[FusionView], grid: VoxelGrid) -> tuple[list[Tensor], Tensor]:
     """Take one view after another, each with all threads."""
+    refuse_labels(any(view.unfit is not None and bool(view.unfit) for view in views))
     touched = [touched_blocks(view, grid) for view in views]
     return integrate.located(blocks, touched, [find_blocks(blocks, keys) for keys in touched])
 

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import OPERATIONS, kernel
-from pcdata.contracts.on_host import on_host, uploaded
 from pcdata.functional.tsdf import integrate
 from pcdata.functional.tsdf.blocks import TSDF_SCALE, VoxelBlocks
 from pcdata.functional.tsdf.grid import VOXELS, VoxelGrid
-from pcdata.functional.tsdf.views import FusionView
+from pcdata.functional.tsdf.views import FusionView, refuse_labels
 from pcdata.geometry.lens_models import is_plain
 from pcdata.kernels.cuda.launching import launcher_of
+from pcdata.kernels.cuda.view_numbers import OF_VOXELS, numbers_of
 from pcdata.kernels.cuda.voxel_tables import planes_of, row_table, touched_keys
 
 _TOGETHER = 4  # voxels of a thread, kTogether of the kernel
@@ -41,6 +41,7 @@ def locate_views(blocks: VoxelBlocks, views: Sequence[FusionView], grid: VoxelGr
     if found is None:
         fallen: tuple[list[Tensor], Tensor] = OPERATIONS["locate_views"].reference(blocks, views, grid)
         return fallen
+    refuse_labels(found.is_unfit)
     rows = [_rows_of(blocks, keys) for keys in found.touched]
     return [integrate.with_new_rows(blocks, *pair, found.missing) for pair in zip(rows, found.touched)], found.missing
 
@@ -71,9 +72,10 @@ def integrate_view(blocks: VoxelBlocks, rows: Tensor, view: FusionView, grid: Vo
     launcher.launch(
         "pc_integrate_view",
         len(rows) * (VOXELS // _TOGETHER),
-        *(view.depth.contiguous(), *images, height, width, numbers_of(view, grid), int(view.distortion is not None)),
-        *(grid.block_size, float(np.float32(TSDF_SCALE / grid.truncation)), int(carve)),
-        *(rows, len(rows), blocks.keys, *planes_of(launcher, blocks)),
+        *(view.depth.contiguous(), *images, height, width),
+        *(numbers_of(view, grid)[OF_VOXELS], int(view.distortion is not None), grid.block_size),
+        *(float(np.float32(TSDF_SCALE / grid.truncation)), int(carve), rows, len(rows), blocks.keys),
+        *planes_of(launcher, blocks),
     )
 
 
@@ -82,15 +84,3 @@ def _rows_of(blocks: VoxelBlocks, keys: Tensor) -> Tensor:
     rows, launcher = torch.empty_like(keys), launcher_of(keys)
     launcher.launch("pc_find_blocks", len(keys), *row_table(launcher, blocks), keys, len(keys), rows)
     return rows
-
-
-def numbers_of(view: FusionView, grid: VoxelGrid) -> Tensor:
-    """Return (39,) float64: what the kernel needs to know of a view besides its images."""
-    image = integrate.image_from_world(view)
-    steps = (image[:, :3] * grid.voxel_size).float()
-    lens = torch.zeros(13, dtype=torch.float32, device="cpu")
-    if view.distortion is not None:
-        lens[:12], lens[12] = on_host(view.distortion).float(), view.fold
-    pinhole = torch.tensor(view.pinhole, dtype=torch.float32, device="cpu")
-    parts = [image.flatten(), steps.flatten(), pinhole, lens]
-    return uploaded(torch.cat([part.double() for part in parts]), view.depth.device)

@@ -11,11 +11,11 @@ from torch import Tensor
 
 from pcdata.contracts.on_host import uploaded
 from pcdata.functional.rows import ptr_from_counts
-from pcdata.functional.tsdf import integrate
 from pcdata.functional.tsdf.blocks import VoxelBlocks
 from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.views import FusionView
 from pcdata.kernels.cuda.launching import Launcher, launcher_of
+from pcdata.kernels.cuda.view_numbers import OF_RAYS, numbers_of
 
 _FEWEST_PLACES = 1 << 12  # of a table
 _PLANES = {"color": 1, "views": 2, "label": 4}  # bits of VoxelPlanes
@@ -42,9 +42,10 @@ def row_table(launcher: Launcher, blocks: VoxelBlocks) -> tuple[Any, ...]:
 
 def planes_of(launcher: Launcher, blocks: VoxelBlocks) -> tuple[Tensor, int]:
     """Return the addresses of all chunks, on the device, and which planes there are."""
-    addresses = [launcher.address(chunk["tsdf"]) for chunk in blocks.chunks]  # the first plane
-    chunks = uploaded(torch.tensor(addresses, dtype=torch.int64, device="cpu"), blocks.device)
-    return chunks, sum(bit for name, bit in _PLANES.items() if name in blocks.planes)
+    if blocks.addresses is None or len(blocks.addresses) < len(blocks.chunks):
+        addresses = [launcher.address(chunk["tsdf"]) for chunk in blocks.chunks]  # the first plane
+        blocks.addresses = uploaded(torch.tensor(addresses, dtype=torch.int64, device="cpu"), blocks.device)
+    return blocks.addresses, sum(bit for name, bit in _PLANES.items() if name in blocks.planes)
 
 
 class Touched(NamedTuple):
@@ -52,6 +53,7 @@ class Touched(NamedTuple):
 
     touched: list[Tensor]  # of every view the sorted keys (N,) of its blocks
     missing: Tensor  # (M,) sorted keys of those that have no row
+    is_unfit: bool  # whether a label does not fit
 
 
 def touched_keys(blocks: VoxelBlocks | None, views: Sequence[FusionView], grid: VoxelGrid) -> Touched | None:
@@ -64,9 +66,9 @@ def touched_keys(blocks: VoxelBlocks | None, views: Sequence[FusionView], grid: 
     most = sum(view.depth.numel() for view in views) * (2 * halves + 1)
     size = _power_of_two(most // 8)
     known = (None, None, 0, 0) if blocks is None else row_table(launcher, blocks)
-    numbers = _numbers_of(views, grid, device)
+    numbers = [numbers_of(view, grid)[OF_RAYS] for view in views]
     while True:
-        room = torch.zeros(size + size // 2 + _COUNTERS + len(views), dtype=torch.int64, device=device)
+        room = torch.zeros(size + size // 2 + _COUNTERS + 2 * len(views), dtype=torch.int64, device=device)
         places, stamps = room[:size], room[size:].view(torch.int32)
         counters = stamps[size:]
         touched, missing = torch.empty((2, size), dtype=torch.int64, device=device).unbind()
@@ -81,23 +83,16 @@ def touched_keys(blocks: VoxelBlocks | None, views: Sequence[FusionView], grid: 
                 *(places, stamps, size - 1, probes, *known, touched, missing, counters),
                 block=_TILE_WIDTH * _TILE_HEIGHT,
             )
-        far, is_full, num_missing, _, *of_views = counters[: _COUNTERS + len(views)].tolist()
+            if view.unfit is not None:
+                counters[_COUNTERS + len(views) + number].copy_(view.unfit[0])
+        far, is_full, num_missing, _, *of_views = counters[: _COUNTERS + 2 * len(views)].tolist()
         if far:
             return None
         if not is_full:
-            ends = itertools.pairwise(ptr_from_counts(of_views).tolist())
+            ends = itertools.pairwise(ptr_from_counts(of_views[: len(views)]).tolist())
             parts = [touched[start:end].sort().values for start, end in ends]
-            return Touched(parts, missing[:num_missing].sort().values)
+            return Touched(parts, missing[:num_missing].sort().values, any(of_views[len(views) :]))
         size *= _GROWTH
-
-
-def _numbers_of(views: Sequence[FusionView], grid: VoxelGrid, device: torch.device) -> Tensor:
-    """Return (V, 15) float64: the way of the rays through blocks."""
-    rows = [
-        torch.cat([turn.double().flatten(), fraction.double(), camera.double()])
-        for turn, fraction, camera in (integrate.camera_in_blocks(view, grid) for view in views)
-    ]
-    return uploaded(torch.stack(rows), device)
 
 
 def _power_of_two(least: int) -> int:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import why_unavailable
-from pcdata.errors import UnitError
+from pcdata.errors import CaptureError, UnitError
 from pcdata.functional import tsdf
 from pcdata.functional.tsdf.grid import pack_keys
 from pcdata.rng import seeded
@@ -259,7 +259,7 @@ def test_on_a_device_a_frame_waits_once_and_a_surface_once(carve, monkeypatch):
         moved = frame.to(device)
         with pretend_device.watching() as watched:
             there.integrate(moved)
-        assert watched.waits.total() == 2, watched.waits  # for the range of labels, and for the number of blocks
+        assert watched.waits.total() == 1, watched.waits
         here.integrate(frame)
     assert torch.equal(pretend_device.host(there.blocks.keys), here.blocks.keys)
     with pretend_device.watching() as watched:
@@ -276,7 +276,7 @@ def test_on_a_device_a_frame_waits_once_and_a_surface_once(carve, monkeypatch):
 @pretends
 def test_views_of_one_capture_wait_once_together(monkeypatch):
     device = harness.as_on_a_gpu(monkeypatch)
-    frame = replace(tabletop_frame(3), labels=None)
+    frame = tabletop_frame(3)
     volume = TSDFVolume(voxel_size=0.03, device=device)
     volume.integrate(frame.to(device))  # sends the rays of the cameras
     moved = frame.to(device)
@@ -286,3 +286,22 @@ def test_views_of_one_capture_wait_once_together(monkeypatch):
     expected = volume_of(frame, frame, voxel_size=0.03, backend="torch").blocks
     for name, plane in expected.chunks[0].items():
         assert torch.equal(plane, pretend_device.host(volume.blocks.chunks[0][name])), name
+
+
+@pretends
+@pytest.mark.parametrize("backend", ["auto", "torch"])
+@pytest.mark.parametrize("label", [2**31, -(2**31) - 1, 2**32])
+def test_labels_beyond_32_bits_are_refused_there_and_leave_the_field_as_it_was(label, backend, monkeypatch):
+    device = harness.as_on_a_gpu(monkeypatch)
+    frame = random_frame((5, 7), 0.4, 0, lens=False, images=True)
+    volume = TSDFVolume(voxel_size=0.03, device=device, backend=backend)
+    volume.integrate(frame.to(device))
+    before = {name: pretend_device.host(plane).clone() for name, plane in volume.blocks.chunks[0].items()}
+    labels = frame.labels.clone()
+    labels[0, 2, 3] = label
+    for door in (volume.integrate, volume.estimate_bytes):
+        with pytest.raises(CaptureError, match="labels must fit 32 bits"):
+            door(replace(frame, labels=labels).to(device))
+    assert all(torch.equal(pretend_device.host(volume.blocks.chunks[0][name]), plane) for name, plane in before.items())
+    labels[0, 2, 3] = 2**31 - 1
+    volume.integrate(replace(frame, labels=labels).to(device))

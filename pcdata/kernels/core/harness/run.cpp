@@ -11,6 +11,7 @@
 #include <vector>
 
 #if defined(__SANITIZE_ADDRESS__)
+#include <sanitizer/asan_interface.h>
 #include <sanitizer/common_interface_defs.h>
 #endif
 
@@ -52,11 +53,10 @@ std::unique_ptr<char[]> take_stack() {
 
 void give_back(std::unique_ptr<char[]> stack) {
 #if defined(__SANITIZE_ADDRESS__)
-  stack.reset();  // what is forbidden to touch on it would stay so
-#else
+  ASAN_UNPOISON_MEMORY_REGION(stack.get(), kStack);  // what the fiber was forbidden to touch
+#endif
   constexpr std::size_t kMost = 1 << 11;
   if (spare_stacks().size() < kMost) spare_stacks().push_back(std::move(stack));
-#endif
 }
 
 // Where a number of fibers wait for one another.

@@ -27,9 +27,9 @@ PC_HD I color_turn(const I& views, const I& voxel) {
 // The stored color with a pixel's averaged in; `share` in steps of 2^-15.
 template <class I>
 PC_HD I mixed_color(const I& old, const I& pixel, const I& share, const I& turn) {
-  const I r = ((((pixel & 1023) - (old & 1023)) * share + turn) >> 15);
-  const I g = ((((pixel >> 10 & 1023) - (old >> 10 & 1023)) * share + turn) >> 15) << 10;
-  const I b = ((((pixel >> 20 & 1023) - (old >> 20 & 1023)) * share + turn) >> 15) << 20;
+  const I r = (((pixel & 1023) - (old & 1023)) * share + turn) >> 15;
+  const I g = ((((pixel >> 10 & 1023) - (old >> 10 & 1023)) * share + turn) >> 15) * (1 << 10);  // may be negative
+  const I b = ((((pixel >> 20 & 1023) - (old >> 20 & 1023)) * share + turn) >> 15) * (1 << 20);
   return ((old + r) + g) + b;
 }
 
