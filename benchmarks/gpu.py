@@ -37,7 +37,7 @@ from pcdata.contracts import dispatch
 from pcdata.kernels.cuda import launching
 from pcdata.live import LivePipeline
 from pcdata.rng import seeded
-from pcdata.structures import DepthFrame, TSDFVolume
+from pcdata.structures import DepthFrame, PointCloud, TSDFVolume
 from pcdata.synthetic import tabletop
 from tests.factories import differences, tree
 from tests.functional import test_op_contract as operations
@@ -241,6 +241,10 @@ def timing_cases(device: torch.device, size: tuple[int, int]) -> Iterator[tuple[
     )
     yield "normals 2 cm, 30", 0.6, lambda: F.estimate_normals(points, radius=0.02, max_neighbors=30, grid=grid)
     yield from depth_cases(frame)
+    batch = augmented_batch(32, 8192 if size[0] >= 100 else 50).to(device)
+    motions = [T.RandomRotation(), T.RandomScale(), T.RandomTranslation(), T.RandomJitter(), T.RandomPointDropout()]
+    augment = T.Compose(motions)
+    yield "augmentation 32 x 8192", None, lambda: augment(batch, generator=seeded(0))
     yield "16 nearest", None, lambda: F.knn(points, k=16)
     yield "chain to 1024 points", 3.0, lambda: chain(frame)
     yield "chain to 1024 points, four clouds", 4.0, lambda: [chain(frame) for _ in range(4)]
@@ -251,6 +255,12 @@ def timing_cases(device: torch.device, size: tuple[int, int]) -> Iterator[tuple[
         yield f"TSDF 2 mm, colors and labels, by {backend}", 0.3, lambda v=volume: v.integrate(frame)
         yield f"TSDF 2 mm, points by {backend}", 0.5, lambda v=volume: v.extract_points()
         yield f"TSDF 2 mm, triangles by {backend}", None, lambda v=volume: v.extract_mesh()
+
+
+def augmented_batch(clouds: int, each: int) -> PointCloud:
+    points = torch.rand((clouds * each, 3), generator=seeded(0))
+    ptr = torch.arange(clouds + 1, dtype=torch.int64) * each
+    return PointCloud(points=points, ptr=ptr, normals=torch.nn.functional.normalize(points), frame_id="base")
 
 
 def depth_cases(frame: DepthFrame) -> Iterator[tuple[str, float | None, Callable[[], Any]]]:

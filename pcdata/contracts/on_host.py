@@ -59,6 +59,14 @@ def uploaded(values: Tensor, device: torch.device) -> Tensor:
     return there
 
 
+def taken(tensor: Tensor, index: int | slice) -> Tensor:
+    """Return a part of a tensor; the host knows of it what it knows of the whole."""
+    part, copy = tensor[index], held(tensor)
+    if copy is not None:
+        hold(part, copy[index])
+    return part
+
+
 def bounds_of(ptr: Tensor) -> list[int]:
     """Return row pointers as a list."""
     bounds: list[int] = (ptr if ptr.device.type == "cpu" else on_host(ptr)).tolist()

@@ -156,8 +156,8 @@ def _all_affine(rows: NDArray[np.float64]) -> bool:
 
 def is_rigid(matrix: Tensor, *, tolerance: float = 1e-5) -> bool:
     """Say whether all (..., 4, 4) matrices are rotations and translations, or mirrors: they keep every distance."""
-    linear = matrix[..., :3, :3].double()
-    identity = torch.eye(3, dtype=torch.float64, device=matrix.device)
+    linear = (matrix if matrix.is_cpu else on_host(matrix))[..., :3, :3].double()
+    identity = torch.eye(3, dtype=torch.float64, device="cpu")
     return bool(((linear @ linear.mT - identity).abs() <= tolerance).all())
 
 

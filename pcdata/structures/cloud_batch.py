@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from pcdata.contracts.on_host import taken, uploaded
 from pcdata.errors import DTypeError, FrameError, OutOfRangeError, UnitError
 from pcdata.functional.motions import led_back
 from pcdata.geometry import rigid
@@ -179,17 +180,21 @@ class CloudBatch(Structure):
     def _facts_moved(self, matrices: Tensor, frame_id: str | None, unit: str | None) -> dict[str, Any]:
         """Return what the clouds know after motions (S, B, 4, 4): the way back to the source absorbs their inverses."""
         viewpoint, layout, source_from_cloud = self.viewpoint, self.layout, self.source_from_cloud
-        for matrix in matrices:
+        part_of = operator.getitem if matrices.is_cpu else taken
+        for step in range(len(matrices)):
+            matrix = part_of(matrices, step)
             if self.recorded_signals:  # they stay as recorded: how the clouds moved is in source_from_cloud
                 refuse_mirror(type(self).__name__, self.recorded_signals, matrix)
             if viewpoint is not None:
-                one_row_each = torch.arange(self.num_clouds + 1, dtype=torch.int64, device=viewpoint.device)
+                one_row_each = torch.arange(self.num_clouds + 1, dtype=torch.int64, device="cpu")
+                if not viewpoint.is_cpu:
+                    one_row_each = uploaded(one_row_each, viewpoint.device)
                 viewpoint = KINDS[Kind.POSITION].move(viewpoint, one_row_each, matrix)
         if layout is None:
             source_from_cloud = led_back(source_from_cloud, matrices)
         else:
-            for matrix in matrices:
-                source_from_cloud = led_back(source_from_cloud, matrix[None])
+            for step in range(len(matrices)):
+                source_from_cloud = led_back(source_from_cloud, part_of(matrices, slice(step, step + 1)))
                 layout = layout if rigid.is_rigid(source_from_cloud) else None
         known = {"frame_id": frame_id if frame_id is not None else self.frame_id, "unit": unit or self.unit}
         check_names(type(self).__name__, **known)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import operator
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -12,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from pcdata.contracts.known import FINITE, is_known, note
-from pcdata.contracts.on_host import bounds_of, counts_of, hold, read_together, uploaded
+from pcdata.contracts.on_host import bounds_of, counts_of, hold, read_together, taken, uploaded
 from pcdata.contracts.tensors import check_ptr_values, check_tensors
 from pcdata.errors import DTypeError, ShapeError
 from pcdata.functional.image_grid import ImageGrid, pixels_rise
@@ -296,7 +297,8 @@ class PointCloud(CloudBatch):
             PoseError: a matrix is not affine (is it made for row vectors?), not finite, or singular.
         """
         matrices = self._checked_motions("PointCloud.transformed", matrix[None])
-        rows = moved(self.fields(), self.kinds, self.ptr, matrices[0])
+        first = matrices[0] if matrices.is_cpu else taken(matrices, 0)
+        rows = moved(self.fields(), self.kinds, self.ptr, first)
         return self._with_rows(rows, **self._facts_moved(matrices, frame_id, unit))
 
     def with_facts_moved(self, matrices: Tensor) -> PointCloud:
@@ -311,16 +313,23 @@ class PointCloud(CloudBatch):
         matrices = self._checked_motions("PointCloud.with_facts_moved", matrices)
         fields = self.fields()
         points = fields.pop("points")
-        for matrix in matrices:
-            fields = moved(fields, self.kinds, self.ptr, matrix) if fields else {}
+        part_of = operator.getitem if matrices.is_cpu else taken
+        for step in range(len(matrices)):
+            fields = moved(fields, self.kinds, self.ptr, part_of(matrices, step)) if fields else {}
         return self._with_rows({"points": points, **fields}, **self._facts_moved(matrices, None, None))
 
     def _checked_motions(self, where: str, matrices: Tensor) -> Tensor:
         """Require affine matrices, (S, B, 4, 4), one for each cloud; return them as coordinates are multiplied."""
         if tuple(matrices.shape[1:]) != (self.num_clouds, 4, 4):
             raise ShapeError(f"{where}: matrix must be ({self.num_clouds}, 4, 4), {tuple(matrices.shape[1:])}")
-        wide = matrices.to(dtype=torch.float64, device=self.device)
-        if len(matrices) * self.num_clouds <= _FEW_MOTIONS or not are_plain_motions(wide.detach()):
+        device = self.device
+        if matrices.is_cpu and device.type != "cpu" and not matrices.requires_grad:
+            wide = uploaded(matrices.to(torch.float64, copy=True), device)
+        else:
+            wide = matrices.to(dtype=torch.float64, device=device)
+        if len(matrices) * self.num_clouds <= _FEW_MOTIONS or not are_plain_motions(
+            wide.detach() if wide.requires_grad else wide
+        ):
             for matrix in matrices:
                 check_affine(where, matrix)
         return wide

@@ -15,11 +15,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pcdata.contracts.on_host import counts_of
+from pcdata.contracts.on_host import bounds_of, counts_of
 from pcdata.errors import PcdataError
 from pcdata.functional.motions import draw_motions
 from pcdata.functional.noise import PointStep, move_points
-from pcdata.functional.rows import pick_rows
+from pcdata.functional.rows import pick_rows, rows_of_mask
 from pcdata.functional.stored_rows import gather_kept
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
@@ -124,7 +124,9 @@ def _run(
     if left:
         rows |= gather_kept({name: others.pop(name) for name in left}, left, ptr, kept)
     if kept is not None and others:
-        rows |= pick_rows(others, kept[0], in_place=in_place)
+        mask = kept[0]
+        wanted = mask if mask.is_cpu else rows_of_mask(mask, bounds_of(kept[1])[-1])
+        rows |= pick_rows(others, wanted, in_place=in_place)
     return derived(cloud, **attributes(rows), layout=layout)
 
 

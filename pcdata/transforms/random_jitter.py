@@ -7,7 +7,7 @@ import itertools
 import torch
 from torch import Tensor
 
-from pcdata.contracts.on_host import bounds_of
+from pcdata.contracts.on_host import bounds_of, on_host, uploaded
 from pcdata.errors import ConfigError, DTypeError, FrameError
 from pcdata.functional.nearest import sum_of_squares
 from pcdata.functional.noise import PointStep, dropped_rows, move_points, normal_rows
@@ -95,8 +95,9 @@ class RandomPointDropout(SelectTransform):
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Draw the part, then which points."""
-        keep, ptr = dropped_rows(streams.take(2), cloud.ptr.cpu(), self.low, self.high)
-        return keep.to(cloud.device), ptr.to(cloud.device)
+        keep, ptr = dropped_rows(streams.take(2), on_host(cloud.ptr), self.low, self.high)
+        device = cloud.device
+        return (keep, ptr) if device.type == "cpu" else (uploaded(keep, device), uploaded(ptr, device))
 
 
 class RandomColorJitter(Transform):

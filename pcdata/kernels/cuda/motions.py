@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+import pcdata.functional.motions
 import pcdata.functional.noise
 import pcdata.functional.rows
 import pcdata.geometry.rigid  # noqa: F401 - the functions must be registered before their kernels
@@ -109,6 +110,20 @@ def inside_box(points: Tensor, lower: Sequence[float], upper: Sequence[float]) -
             return None
         note(FINITE, points)
     return inside
+
+
+@kernel("led_back", "cuda")
+def led_back(source_from_cloud: Tensor, matrices: Tensor) -> Tensor:
+    """Go back on the host, which mostly knows the few numbers of each cloud: it need not wait for them."""
+    back = INNER["led_back"].public(on_host(source_from_cloud), on_host(matrices))
+    return uploaded(back, source_from_cloud.device)
+
+
+@kernel("are_plain_motions", "cuda")
+def are_plain_motions(matrices: Tensor) -> bool:
+    """Look at them on the host."""
+    plain: bool = INNER["are_plain_motions"].public(on_host(matrices))
+    return plain
 
 
 def _covers(points: Tensor, ptr: Tensor) -> bool:

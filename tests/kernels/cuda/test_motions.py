@@ -7,10 +7,14 @@ import math
 import pytest
 import torch
 
+from pcdata import transforms as T
+from pcdata.contracts.on_host import uploaded
 from pcdata.functional.noise import move_points
 from pcdata.functional.rows import inside_box, ptr_from_counts, transform_directions, transform_points
 from pcdata.rng import seeded
+from pcdata.structures import PointCloud
 from tests import pretend_device
+from tests.factories import assert_same
 from tests.kernels.cuda import harness
 
 pytestmark = pytest.mark.skipif(harness.unavailable() is not None, reason=str(harness.unavailable()))
@@ -99,11 +103,26 @@ def test_a_box_is_cut_out_of_points_that_are_finite(ordered):
 @pytest.mark.skipif(not pretend_device.AVAILABLE, reason="this PyTorch has no devices written in Python")
 def test_a_batch_is_augmented_without_waiting(monkeypatch):
     device = harness.as_on_a_gpu(monkeypatch)
-    from pcdata.contracts.on_host import uploaded
-
     points, ptr = cloud().to(device), uploaded(PTR, device)
     with pretend_device.watching() as watched:
         moved = move_points(points, ptr, STEPS["all"])
         moved = transform_directions(moved, ptr, uploaded(matrices(), device))
     assert not watched.waits
     assert moved.device.type == device.type
+
+
+@pytest.mark.skipif(not pretend_device.AVAILABLE, reason="this PyTorch has no devices written in Python")
+def test_a_chain_of_augmentation_waits_for_nothing_and_gives_what_it_gives_on_the_host(monkeypatch):
+    device = harness.as_on_a_gpu(monkeypatch)
+    steps = [T.RandomRotation(), T.RandomScale(), T.RandomShear(), T.RandomTranslation(), T.RandomJitter()]
+    chain = T.Compose([*steps, T.RandomPointDropout(), T.RandomFlip()])
+    normals = torch.nn.functional.normalize(cloud(4), dim=1)
+    labels = torch.arange(sum(COUNTS))
+    here = PointCloud(
+        points=cloud(), ptr=PTR, normals=normals, labels=labels, frame_id="base", viewpoint=torch.zeros(len(COUNTS), 3)
+    )
+    there = here.to(device)
+    with pretend_device.watching() as watched:
+        found = chain(there, generator=seeded(3))
+    assert not watched.waits
+    assert_same(found.to("cpu"), chain(here, generator=seeded(3)), tolerance=1e-6)

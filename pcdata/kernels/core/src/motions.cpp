@@ -2,7 +2,7 @@
 #include <cmath>
 #include <cstring>
 
-#include "pc/noise/normal.hpp"
+#include "pc/math/random.hpp"
 #include "pc/threads.hpp"
 
 namespace pc::motions {
@@ -116,7 +116,7 @@ PC_EXPORT int32_t pc_draw_motions(const pc_context*, const int64_t* keys, int64_
       const double low = draw[3], high = draw[4];
       for (int64_t cloud = 0; cloud < num_clouds; ++cloud) {
         double* matrix = matrices + 16 * (static_cast<int64_t>(draw[0]) * num_clouds + cloud);
-        const uint64_t drawn = noise::word(static_cast<uint64_t>(keys[cloud]), word) >> 11;
+        const uint64_t drawn = math::random_word(static_cast<uint64_t>(keys[cloud]), word) >> 11;
         const double unit = static_cast<double>(drawn) * 0x1p-53;
         const double value = low + (high - low) * unit;
         switch (static_cast<Kind>(static_cast<int>(draw[2]))) {

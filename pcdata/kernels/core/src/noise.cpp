@@ -98,7 +98,7 @@ void choose_rows(int64_t count, int64_t wanted, uint64_t seed, uint8_t* mask) {
   std::memset(mask, 1 - chosen, static_cast<size_t>(count));
   int64_t left = few;
   for (uint64_t number = 0; left > 0; ++number) {
-    const uint64_t mixed = word(seed, number);
+    const uint64_t mixed = math::random_word(seed, number);
     for (const uint64_t half : {mixed & 0xFFFFFFFFu, mixed >> 32}) {
       uint8_t& place = mask[(half * static_cast<uint64_t>(count)) >> 32];
       if (left > 0 && place != chosen) {
@@ -185,10 +185,10 @@ PC_EXPORT int32_t pc_dropped_rows(const pc_context* context, const int64_t* keys
     for (int64_t cloud = 0; cloud < num_clouds; ++cloud) {
       const int64_t count = ptr[cloud + 1] - ptr[cloud];
       const auto key = static_cast<uint64_t>(keys[cloud]);
-      const double part = low + (high - low) * (static_cast<double>(word(key, 0) >> 11) * 0x1p-53);
+      const double part = low + (high - low) * (static_cast<double>(math::random_word(key, 0) >> 11) * 0x1p-53);
       const auto dropped = static_cast<int64_t>(std::nearbyint(static_cast<double>(count) * part));
       const int64_t kept = std::max(count - dropped, std::min<int64_t>(count, 1));
-      choose_rows(count, kept, word(key, 1) >> 2, mask + ptr[cloud]);
+      choose_rows(count, kept, math::random_word(key, 1) >> 2, mask + ptr[cloud]);
       kept_ptr[cloud + 1] = kept_ptr[cloud] + kept;
     }
   });
