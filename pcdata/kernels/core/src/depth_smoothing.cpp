@@ -179,7 +179,9 @@ template <bool kDivides>
 void filter_some(const float* values, const Memory& memory, const Rule& rule, const Persistence& persistence,
                  const Reading<kDivides>& reading, float* filtered) {
   alignas(64) int32_t history[kSome];
-  for (int i = 0; i < kSome; ++i) history[i] = memory.history[i];
+  const uint8_t* old_history = memory.history;
+  uint8_t* new_history = memory.new_history;  // not read again after each byte, which may lie anywhere
+  for (int i = 0; i < kSome; ++i) history[i] = old_history[i];
   const FloatRegister zero{}, keep = zero + rule.keep, delta = zero + rule.delta;
   for (int i = 0; i < kSome; i += kLanes) {
     const FloatRegister now = reading(load<FloatRegister>(values + i)), before = load<FloatRegister>(memory.last + i);
@@ -192,7 +194,7 @@ void filter_some(const float* values, const Memory& memory, const Rule& rule, co
     store(memory.new_last + i, select(valid, mixed, before));
     store(history + i, select(valid, select(steady, shifted, Int32Register{}) | one, shifted));
   }
-  for (int i = 0; i < kSome; ++i) memory.new_history[i] = static_cast<uint8_t>(history[i]);
+  for (int i = 0; i < kSome; ++i) new_history[i] = static_cast<uint8_t>(history[i]);
 }
 
 // Up to kSome pixels; what lies beyond them is not looked at.

@@ -296,15 +296,17 @@ PC_EXPORT int32_t pc_filled_confidence(const pc_context* context, const float* b
       for (int64_t at = begin; at < end; at += kSome) {
         const auto some = static_cast<int>(std::min<int64_t>(kSome, end - at));
         int32_t was[kSome], guess[kSome];
+        const float *old_depth = before + at, *new_depth = after + at;
+        uint8_t* to = filled_confidence + at;  // not read again after each byte, which may lie anywhere
         for (int i = 0; i < some; ++i)
-          was[i] = confidence != nullptr ? confidence[at + i] : before[at + i] > 0 ? kRead : 0;
+          was[i] = confidence != nullptr ? confidence[at + i] : old_depth[i] > 0 ? kRead : 0;
         for (int i = 0; i < some; ++i) guess[i] = far != nullptr && far[at + i] != 0 ? kFar : kNear;
         for (int i = 0; i < some; ++i) {
-          const int32_t guessed = (before[at + i] == 0) & (after[at + i] > 0);
+          const int32_t guessed = (old_depth[i] == 0) & (new_depth[i] > 0);
           was[i] = guessed != 0 ? guess[i] : was[i];
           filled |= guessed;
         }
-        for (int i = 0; i < some; ++i) filled_confidence[at + i] = static_cast<uint8_t>(was[i]);
+        for (int i = 0; i < some; ++i) to[i] = static_cast<uint8_t>(was[i]);
       }
       if (filled != 0) any.store(true, std::memory_order_relaxed);
     });

@@ -126,7 +126,9 @@ PC_EXPORT int32_t pc_flying_pixels(const pc_context* context, const float* depth
           const RegisterMask fly = flying_pixels(some, part, wanted);
           store(found + (u - first), select(fly, Int32Register{} + 1, Int32Register{}));
         }
-        for (int64_t u = first; u < last; ++u) flying[row * width + u] = static_cast<uint8_t>(found[u - first]);
+        uint8_t* to = flying + row * width + first;
+        const auto count = static_cast<int>(last - first);  // not read again after each byte, which may lie anywhere
+        for (int i = 0; i < count; ++i) to[i] = static_cast<uint8_t>(found[i]);
       }
     });
   });
