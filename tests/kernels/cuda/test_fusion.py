@@ -156,6 +156,14 @@ def test_more_blocks_than_the_first_table_holds(ordered):
     assert torch.equal(tsdf.find_blocks(growing, expected, backend=harness.BACKEND)[0], made.find(expected))
 
 
+@pytest.mark.parametrize("voxels", [2, 63.9, 64])
+def test_the_narrowest_and_the_widest_truncation(voxels, ordered):
+    some = replace(view(0), depth=view(0).depth * (torch.arange(64) % 16 == 0))
+    grid = tsdf.VoxelGrid(0.01, voxels * 0.01)
+    keys = tsdf.touched_blocks(some, grid, backend="torch")
+    assert torch.equal(tsdf.touched_blocks(some, grid, backend=harness.BACKEND), keys)
+
+
 def test_blocks_of_several_chunks(ordered):
     made, found = (tsdf.VoxelBlocks(tsdf.voxel_planes(), torch.device("cpu")) for _ in range(2))
     keys = tsdf.touched_blocks(view(0), GRID, backend="torch")

@@ -175,7 +175,7 @@ PC_BLOCK_KERNEL(pc_write_crossings, PC_SORTED_PARAMETERS, PC_TABLE_PARAMETERS, P
       normals[3 * row + a] = length > 0 ? slope[a] / length : a != axis ? 0.0f : after > before ? 1.0f : -1.0f;
 
     constexpr int next[3] = {14, 16, 22};  // around
-    const bool is_beside = inner[axis] == kEdge - 1;
+    const bool is_beside = (voxel >> 3 * axis & 7) == kEdge - 1;
     const int voxel_step = axis == 0 ? 1 : axis == 1 ? kEdge : kSlab;
     const int end_voxel = voxel + (is_beside ? -(kEdge - 1) * voxel_step : voxel_step);
     char* const here = field.planes.block(own);

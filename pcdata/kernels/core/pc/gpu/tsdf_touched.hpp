@@ -11,6 +11,7 @@ namespace pc::gpu {
 
 constexpr int kTileWidth = PC_WARP, kTileHeight = 8;  // pixels, a thread each
 constexpr int kMet = 1024;                            // places of what a tile has met
+constexpr int kMostOffsets = 33;                      // a truncation of 64 voxels, in halves of a block, both ways
 constexpr int kMetProbes = 8;                         // then it counts as not met
 
 // What a view says of the way of its rays through blocks, as doubles that hold float32 and whole numbers.
@@ -80,7 +81,10 @@ PC_BLOCK_KERNEL(pc_touch_blocks, const float* depth, const float* rays, int64_t 
                 int32_t* stamps, int64_t table_mask, int64_t probes, PC_TABLE_PARAMETERS, int64_t* touched,
                 int64_t* missing, int32_t* counters) {
   PC_SHARED(uint64_t, met, kMet);
+  PC_SHARED(float, offsets, kMostOffsets);
   for (int i = thread_in_block(); i < kMet; i += block_size()) met[i] = 0;
+  for (int i = thread_in_block(); i <= 2 * halves; i += block_size())
+    offsets[i] = static_cast<float>(truncation * static_cast<double>(i - halves) / static_cast<double>(halves));
   sync_block();
   const TouchedTable found{table, stamps, table_mask, probes, {keys, places, mask, shift}, touched, missing, counters};
   const RaysInBlocks view_rays(numbers);
@@ -91,8 +95,8 @@ PC_BLOCK_KERNEL(pc_touch_blocks, const float* depth, const float* rays, int64_t 
   const int64_t pixel = is_inside ? v * width + u : 0;
   const float reading = is_inside ? depth[pixel] : 0.0f, x = rays[pixel], y = rays[height * width + pixel];
   uint64_t before = 0;  // what the offset before has touched
-  for (int64_t step = -halves; step <= halves; ++step) {
-    const float z = reading + static_cast<float>(truncation * static_cast<double>(step) / static_cast<double>(halves));
+  for (int step = 0; step <= 2 * halves; ++step) {
+    const float z = reading + offsets[step];
     uint64_t own = 0;
     if (reading > 0 && z > 0) {
       int64_t at[3];
