@@ -16,6 +16,7 @@ from pcdata.functional.depth.holes import fill_rows, filled_images
 from pcdata.functional.depth.temporal import temporal_step
 from pcdata.functional.fixed_rows import move_kept
 from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.largest_planes import largest_planes
 from pcdata.functional.noise import move_points
 from pcdata.functional.rows import inside_box, transform_directions
 from pcdata.rng import seeded
@@ -72,10 +73,18 @@ def _augmented(backend: str) -> Any:
     return moved, turned, inside_box(moved, (-1, -1, -1), (1, 1, 1), backend=backend)
 
 
+def _largest_planes(backend: str) -> Any:
+    points = torch.rand((300, 3), generator=seeded(2))
+    points[:200, 2] = 0.3 * points[:200, 0]
+    options = {"distance": 0.01, "num_hypotheses": 40, "seed": 5, "probability": None}
+    return largest_planes(points, torch.tensor([0, 300]), **options, backend=backend)
+
+
 CALLS: dict[str, Call] = {
     "mask_depth": lambda backend: mask_depth(depth_images(), 0.6, 1.2, None, backend=backend),
     "deproject_images": lambda backend: deproject_images(depth_images(), cameras(), None, None, {}, backend=backend),
     "deproject_into_box": _box,
+    "largest_planes": _largest_planes,
     "move_kept": _move_kept,
     "move_points": _augmented,
     "reciprocals": lambda backend: reciprocals(depth_images(), torch.tensor([20.0, 30.0]), backend=backend),

@@ -7,6 +7,8 @@ import torch
 
 from pcdata import functional as F
 from pcdata.contracts.dispatch import INNER, OPERATIONS
+from pcdata.functional.largest_planes import largest_planes
+from pcdata.rng import seeded
 from tests import pretend_device
 from tests.factories import assert_same
 from tests.functional.test_op_contract import EXAMPLES, call, clouds_of, packed
@@ -95,5 +97,7 @@ def test_every_kernel_is_run_by_some_operation():
     F.statistical_outlier_mask(torch.rand(90, 3), num_neighbors=40, backend=harness.BACKEND)
     F.estimate_normals(torch.rand(90, 3), max_neighbors=40, backend=harness.BACKEND)
     F.farthest_point_sample(torch.rand(33_000, 3), num_samples=2, backend=harness.BACKEND)  # all blocks for one cloud
+    many, ptr = torch.rand(17_000, 3, generator=seeded(0)), torch.tensor([0, 17_000])  # some of them are searched
+    largest_planes(many, ptr, distance=0.1, num_hypotheses=5, seed=0, probability=0.9, backend=harness.BACKEND)
     ran |= set(launcher.started)
     assert ran == set(harness.kernel_names())
