@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from pcdata.contracts.on_host import taken, uploaded
+from pcdata.contracts.on_host import on_host, taken, uploaded
 from pcdata.errors import DTypeError, FrameError, OutOfRangeError, UnitError
 from pcdata.functional.motions import led_back
 from pcdata.geometry import rigid
@@ -175,6 +175,19 @@ class CloudBatch(Structure):
             "meta": vars(self)["meta"][clouds],
             "history": vars(self)["history"][clouds],
             "recorded_signals": signals,
+        }
+
+    def _facts_repeated(self, clouds: Tensor) -> dict[str, Any]:
+        """Return what the clouds with these numbers (M,) know, for rows that are picked in another order."""
+        meta, history, there = vars(self)["meta"], vars(self)["history"], on_host(clouds).tolist()
+        return {
+            "layout": None,
+            "viewpoint": None if self.viewpoint is None else self.viewpoint[clouds],
+            "source_from_cloud": self.source_from_cloud[clouds],
+            "frames": {name: matrix[clouds] for name, matrix in self.frames.items()},
+            "meta": Metas(meta[b : b + 1] for b in there),
+            "history": Histories(history[b : b + 1] for b in there),
+            "recorded_signals": {name: signal.rows(clouds) for name, signal in self.recorded_signals.items()},
         }
 
     def _facts_moved(self, matrices: Tensor, frame_id: str | None, unit: str | None) -> dict[str, Any]:

@@ -247,6 +247,13 @@ class PointCloud(CloudBatch):
                     note(fact, rows["source_index"], ptr)
         return self._with_rows(rows, ptr=ptr, layout=layout)
 
+    def parted(self, index: Tensor, ptr: Tensor, clouds: Tensor) -> PointCloud:
+        """Make M clouds of rows (K,) int64, cut by ``ptr`` (M+1,): those of one are rows of cloud ``clouds[m]``."""
+        rows = pick_rows(self.fields(), index)
+        if is_known(FINITE, self.points):
+            note(FINITE, rows["points"])
+        return self._with_rows(rows, ptr=ptr, **self._facts_repeated(clouds))
+
     def _with_rows(self, rows: Mapping[str, Tensor], **others: Any) -> PointCloud:
         """Replace all per-point fields at once, and any other attributes, by ones that are known to fit."""
         return derived(self, **attributes(rows), **others)

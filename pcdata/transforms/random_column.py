@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pcdata.contracts.on_host import bounds_of
+from pcdata.contracts.on_host import counts_of, uploaded
 from pcdata.errors import TooFewPointsError
-from pcdata.functional.rows import ptr_after_mask
-from pcdata.rng import Streams, seeded
+from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask
+from pcdata.rng import Streams, words
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, sample_name
 from pcdata.transforms.decisions import Decisions
@@ -34,49 +34,56 @@ class RandomColumn(DropLimit):
 
     is_random = True
     decides_by = "point"
+    version = 2
 
     size: Metres = 1.0
     min_points: Count = 1025
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
-        """Draw until a column is full enough."""
-        bounds = bounds_of(data.ptr)
-        seeds = streams.seeds().tolist()
-        return self._around(
-            data,
-            [self._draw(data, b, data.points[bounds[b] : bounds[b + 1]], seed) for b, seed in enumerate(seeds)],
-        )
+        """Draw a point of every cloud, and again of those whose column is not full enough."""
+        seeds, owner = uploaded(streams.seeds(), data.device), cloud_of_rows(data.ptr)
+        counts, first = counts_from_ptr(data.ptr), data.ptr[:-1]
+        centers = data.points.new_zeros((data.num_clouds, 3))
+        fullest = torch.zeros_like(counts)
+        searched = torch.ones_like(counts, dtype=torch.bool)  # clouds without a column yet
+        rows = torch.arange(data.num_points, dtype=torch.int64, device=data.device)  # of those
+        for trial in range(_TRIALS if data.num_points else 0):
+            drawn = (words(seeds, torch.full_like(seeds, trial)) >> 1 & (2**62 - 1)) % counts.clamp(min=1)
+            place = data.points[(first + drawn).clamp(max=data.num_points - 1)]
+            inside = rows[self._in_columns(data.points[rows], place[owner[rows]])]
+            found = torch.zeros_like(counts).index_add_(0, owner[inside], torch.ones_like(inside))
+            fullest = torch.maximum(fullest, found)
+            full = searched & (found >= self.min_points)
+            centers = torch.where(full[:, None], place, centers)
+            searched = searched & ~full
+            rows = rows[searched[owner[rows]]]
+            if not len(rows):
+                break
+        if bool(searched.any()):
+            self._refuse(data, int(searched.nonzero()[0]), fullest)
+        return self._around(data, centers)
 
     def repeat(self, data: PointCloud, decided: Decisions) -> Params:
         """The columns about the points that the history tells, however full."""
         like = torch.empty(0, 3, dtype=torch.float32, device="cpu")
-        return self._around(data, [*decided.values("center", like=like).to(data.device)])
+        return self._around(data, decided.values("center", like=like).to(data.device))
 
-    def _around(self, data: PointCloud, centers: list[Tensor]) -> Params:
-        parts = torch.tensor_split(data.points, data.ptr[1:-1].cpu())
-        mask = torch.cat([self._column(points, center) for points, center in zip(parts, centers, strict=True)])
+    def _around(self, data: PointCloud, centers: Tensor) -> Params:
+        mask = self._in_columns(data.points, centers[cloud_of_rows(data.ptr)])
         index = torch.nonzero(mask).squeeze(1)
-        return {"index": index, "ptr": ptr_after_mask(mask, data.ptr), "center": torch.stack(centers)}
+        return {"index": index, "ptr": ptr_after_mask(mask, data.ptr), "center": centers}
 
-    def _column(self, points: Tensor, center: Tensor) -> Tensor:
-        return ((points[:, :2] - center[:2]).abs() <= self.size / 2).all(dim=1)
+    def _in_columns(self, points: Tensor, centers: Tensor) -> Tensor:
+        return ((points[:, :2] - centers[:, :2]).abs() <= self.size / 2).all(dim=1)
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Pick the rows and note the centers."""
         column = data.select(params["index"], params["ptr"])
         return column.with_meta([{"column_center": center} for center in params["center"].tolist()])
 
-    def _draw(self, data: PointCloud, b: int, points: Tensor, seed: int) -> Tensor:
-        generator = seeded(seed)
-        fullest = 0
-        for _ in range(_TRIALS if len(points) else 0):
-            center = points[int(torch.randint(len(points), (), generator=generator, device="cpu"))]
-            count = int(self._column(points, center).sum())
-            if count >= self.min_points:
-                return center
-            fullest = max(fullest, count)
+    def _refuse(self, data: PointCloud, b: int, fullest: Tensor) -> None:
         raise TooFewPointsError(
             f"RandomColumn: cloud {b}{sample_name(data, b)}: of {_TRIALS} columns of {self.size} m none has "
-            f"{self.min_points} points, the fullest has {fullest} (the cloud {len(points)}); lower min_points, or do "
-            "not downsample before it"
+            f"{self.min_points} points, the fullest has {int(fullest[b])} (the cloud {counts_of(data.ptr)[b]}); lower "
+            "min_points, or do not downsample before it"
         )

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import torch
 
-from pcdata.contracts.on_host import bounds_of, counts_of
+from pcdata.contracts.on_host import counts_of
 from pcdata.errors import DTypeError, ReplayError, TooFewPointsError
-from pcdata.functional.rows import ptr_from_counts
+from pcdata.functional.rows import cloud_of_rows, count_per_cloud, ptr_from_counts
 from pcdata.rng import Streams
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, sample_name
@@ -28,25 +28,21 @@ class SplitObjects(DropLimit):
         """Find the labels of every cloud: ``label`` (K,), its ``rank`` in its cloud, and the ``ptr`` (B+1,) of them."""
         if data.labels is None:
             raise DTypeError("SplitObjects: the cloud has no labels; put ClusterObjects before it")
-        found = [torch.unique(own[own >= 0]).cpu() for own in torch.tensor_split(data.labels, data.ptr[1:-1].cpu())]
-        for b, labels in enumerate(found):
-            if not len(labels):
+        owner, labeled = cloud_of_rows(data.ptr), data.labels >= 0
+        counts = count_per_cloud(labeled, data.ptr)
+        for b, count in enumerate(counts.tolist()):
+            if count == 0:
                 raise TooFewPointsError(
                     f"SplitObjects: cloud {b}{sample_name(data, b)} has no labeled point among its "
                     f"{int(data.counts[b])}; check the fields of ClusterObjects"
                 )
-        member = torch.nn.functional.pad((data.labels >= 0).cumsum(0), (1, 0))
-        self.check_drop(
-            counts_of(data.ptr),
-            member[data.ptr].diff().tolist(),
-            lambda b: f"points of cloud {b}{sample_name(data, b)}",
-        )
-        ranks = [torch.arange(len(labels), dtype=torch.int64, device="cpu") for labels in found]
-        return {
-            "label": torch.cat(found),
-            "rank": torch.cat(ranks),
-            "ptr": ptr_from_counts([len(labels) for labels in found]),
-        }
+        self.check_drop(counts_of(data.ptr), counts.tolist(), lambda b: f"points of cloud {b}{sample_name(data, b)}")
+        names, number = torch.unique(data.labels[labeled], return_inverse=True)
+        found = torch.unique(owner[labeled] * len(names) + number).cpu()
+        cloud, label = found // len(names), names.cpu()[found % len(names)]
+        ptr = ptr_from_counts(torch.bincount(cloud, minlength=data.num_clouds))
+        rank = torch.arange(len(found), dtype=torch.int64, device="cpu") - ptr[cloud]
+        return {"label": label, "rank": rank, "ptr": ptr}
 
     def repeat(self, data: PointCloud, decided: Decisions) -> Params:
         """The objects with the labels that the history tells."""
@@ -66,14 +62,17 @@ class SplitObjects(DropLimit):
         return [(k, None) for k, rank in enumerate(ranks) if k == 0 or rank <= ranks[k - 1]]
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
-        """Split each cloud by its labels."""
-        bounds = bounds_of(params["ptr"])
-        parts = []
-        for b, cloud in enumerate(data.unbatch()):
-            assert cloud.labels is not None  # make_params
-            unlabeled = int((cloud.labels < 0).sum())
-            for label in params["label"][bounds[b] : bounds[b + 1]].tolist():
-                rows = torch.nonzero(cloud.labels == label).squeeze(1)
-                ptr = torch.tensor([0, len(rows)], dtype=torch.int64, device=cloud.device)
-                parts.append(cloud.select(rows, ptr).with_meta([{"object": label, "unlabeled": unlabeled}]))
-        return PointCloud.cat(parts)
+        """Sort the labeled rows by object."""
+        assert data.labels is not None  # make_params
+        wanted, ptr = params["label"].to(data.device), params["ptr"].to(data.device)
+        names, number = torch.unique(torch.cat([data.labels, wanted]), return_inverse=True)
+        owner, clouds = cloud_of_rows(data.ptr), cloud_of_rows(ptr)
+        key, of_object = owner * len(names) + number[: len(owner)], clouds * len(names) + number[len(owner) :]
+        place = torch.searchsorted(of_object, key).clamp(max=len(of_object) - 1)
+        rows = ((of_object[place] == key) & (data.labels >= 0)).nonzero().squeeze(1)
+        place = place[rows]
+        counts = torch.bincount(place, minlength=len(wanted))
+        split = data.parted(rows[place.argsort(stable=True)], ptr_from_counts(counts), clouds)
+        unlabeled = count_per_cloud(data.labels < 0, data.ptr).tolist()
+        told = zip(params["label"].tolist(), clouds.tolist(), strict=True)
+        return split.with_meta([{"object": label, "unlabeled": unlabeled[b]} for label, b in told])

@@ -27,7 +27,6 @@ LOOPS = {
     "MergeViews": "every view has its own pose",
     "RandomApply": "has steps that loop, and is given to some clouds alone",
     "RandomColorJitter": "kornia adjusts one image at a time",
-    "RandomColumn": "boxes are cut around points of each cloud",
     "RandomOneOf": "has steps that loop, and is given to some clouds alone",
     "RandomPointCount": "a permutation is drawn of each cloud",
     "RandomSample": "a permutation is drawn of each cloud",
@@ -35,7 +34,6 @@ LOOPS = {
     "RandomShuffle": "a permutation is drawn of each cloud",
     "RandomVoxelSample": "a permutation is drawn of each cloud",
     "RemovePlane": "a cloud has as many planes as it has",
-    "SplitObjects": "every cloud is split into clouds of its own",
     "Undistort": "every camera has its own lens",
 }
 
