@@ -8,6 +8,7 @@
 #include "pc/gpu/deprojection.hpp"
 #include "pc/gpu/depth_filters.hpp"
 #include "pc/gpu/farthest.hpp"
+#include "pc/gpu/farthest_passes.hpp"
 #include "pc/gpu/holes.hpp"
 #include "pc/gpu/motions.hpp"
 #include "pc/gpu/nearest.hpp"
