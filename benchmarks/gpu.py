@@ -5,10 +5,10 @@
     PYTHONPATH=. python benchmarks/gpu.py --rehearse   # without a GPU, on the device of the tests; keeps nothing
 
 Parity: the examples of the contract suites and fused fields, by every backend that serves them. Masks, indices and
-labels are the same; other numbers differ by at most 2e-6. Timings: medians of wall time, synchronized before and after,
-on a warm device, for a synthetic 1280x720 frame; ``waits`` counts the calls in which torch says that the host waited,
-``kernels`` those of pcdata that were started: none means that plain torch ran. One error stops nothing: it is a row,
-and the exit code is 1.
+labels are the same; other numbers differ by at most 2e-6. Timings: medians of wall time, synchronized before and
+after, on a warm device, for a synthetic 1280x720 frame; ``waits`` counts the calls in which torch says that the host
+waited, ``kernels`` those of pcdata that were started: none means that plain torch ran, or a captured graph. One error
+stops nothing: it is a row, and the exit code is 1.
 """
 
 from __future__ import annotations

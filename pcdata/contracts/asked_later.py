@@ -5,27 +5,44 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from typing import NamedTuple
 
 from torch import Tensor
 
-_put_off: ContextVar[list[Tensor] | None] = ContextVar("questions_put_off", default=None)
+
+class PutOff(NamedTuple):
+    """What work that is to be repeated leaves behind."""
+
+    flags: list[Tensor]  # that :func:`is_set` was asked about, (1,) each
+    constants: list[Tensor]  # that it reads again every time
+
+
+_put_off: ContextVar[PutOff | None] = ContextVar("questions_put_off", default=None)
 
 
 @contextmanager
-def asking_later() -> Iterator[list[Tensor]]:
-    """Put off what :func:`is_set` asks; the flags come into the list that this gives."""
-    flags: list[Tensor] = []
-    token = _put_off.set(flags)
+def asking_later() -> Iterator[PutOff]:
+    """Put off what :func:`is_set` asks."""
+    put_off = PutOff([], [])
+    token = _put_off.set(put_off)
     try:
-        yield flags
+        yield put_off
     finally:
         _put_off.reset(token)
 
 
 def is_set(flag: Tensor) -> bool:
     """Say whether a number (1,) is not 0; within :func:`asking_later` it is noted, and taken for 0."""
-    flags = _put_off.get()
-    if flags is None:
+    put_off = _put_off.get()
+    if put_off is None:
         return bool(int(flag))
-    flags.append(flag)
+    put_off.flags.append(flag)
     return False
+
+
+def constant(values: Tensor) -> Tensor:
+    """Return values that lie in some cache; within :func:`asking_later` they are kept as long as work is repeated."""
+    put_off = _put_off.get()
+    if put_off is not None:
+        put_off.constants.append(values)
+    return values

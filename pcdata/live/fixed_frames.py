@@ -88,7 +88,7 @@ class FixedFrames:
     def _work(self) -> tuple[Tensor, list[Any]]:
         """Look at the frame that is held and run the steps; return what the host wants to know, and what each left."""
         depth = self._frame.depth
-        with torch.no_grad(), asking_later() as flags:
+        with torch.no_grad(), asking_later() as put_off:
             least, largest = depth.aminmax()
             is_same = (depth == self._last).all()
             is_good = (least >= 0) & (largest > 0) & largest.isfinite()
@@ -98,7 +98,8 @@ class FixedFrames:
             for work in self._works:
                 data = work(data)
                 stages.append(data)
-            asks = torch.cat(flags).ne(0).any()
+            asks = torch.cat(put_off.flags).ne(0).any()
+            self._constants = put_off.constants  # whose addresses are taken down
             told = [one.double().reshape(1) for one in (least, largest, is_same, asks)]
             for stage in stages:
                 if isinstance(stage, FixedRows):  # row pointers are below 2^53, so a double says them

@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from pcdata.contracts.asked_later import constant
 from pcdata.contracts.dispatch import INNER, kernel
 from pcdata.functional.largest_planes import MOST_POINTS, words_drawn
 from pcdata.functional.planes import MAX_REFINEMENTS, SCORED_BITS, face_planes
@@ -29,7 +30,7 @@ def largest_planes(
             points, ptr, distance, num_hypotheses, seed, probability
         )
         return fallen
-    launcher = launcher_of(points)
+    launcher, words = launcher_of(points), constant(words)
     drawn = torch.empty((clouds, num_hypotheses, 4), dtype=torch.float64, device=device)
     rounded = torch.empty_like(drawn, dtype=torch.float32)
     launcher.launch(

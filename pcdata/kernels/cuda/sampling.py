@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 import pcdata.functional.sampling  # noqa: F401 - the functions must be registered before their kernels
+from pcdata.contracts.asked_later import constant
 from pcdata.contracts.dispatch import INNER, kernel
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.kernels.cuda.launching import Launcher, launcher_of
@@ -32,7 +33,7 @@ def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
     nearest = torch.empty(rows, dtype=torch.float32, device=device)
     each = rows // max(1, clouds)
     if each < _LARGE:
-        picks_ptr = _begins(tuple(counts), device)
+        picks_ptr = constant(_begins(tuple(counts), device))
         block = min(_MOST_THREADS, _WARP << max(0, (each - 1) // _WARP).bit_length())
         launcher.launch_blocks("pc_sample_clouds", clouds, points, ptr, width, picks_ptr, nearest, picks, block=block)
         return picks

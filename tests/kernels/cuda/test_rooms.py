@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pcdata.contracts import dispatch
-from pcdata.contracts.asked_later import asking_later, is_set
+from pcdata.contracts.asked_later import asking_later, constant, is_set
 from pcdata.functional.fixed_rows import move_kept
 from pcdata.rng import seeded
 from tests.kernels.cuda import harness
@@ -85,9 +85,19 @@ def test_rows_that_are_kept_move_together(ordered, counts, extra):
 def test_a_question_is_put_off_or_answered_at_once():
     assert is_set(torch.tensor([2]))
     assert not is_set(torch.tensor([0]))
-    with asking_later() as flags:
+    with asking_later() as put_off:
         assert not is_set(torch.tensor([2]))
-    assert [int(flag) for flag in flags] == [2]
+    assert [int(flag) for flag in put_off.flags] == [2]
+
+
+def test_what_repeated_work_reads_from_caches_is_kept():
+    harness.register()
+    points, ptr = clouds([30, 20], 60, 0.0)
+    with asking_later() as put_off:
+        dispatch.INNER["farthest_rows"].kernels["cuda"](points, ptr, [3, 4])
+        dispatch.INNER["largest_planes"].kernels["cuda"](points, ptr, 0.1, 20, 0, None)
+    assert [tuple(one.shape) for one in put_off.constants] == [(3,), (3, 20)]
+    assert constant(points) is points
 
 
 def test_clouds_too_wide_for_their_cells_are_told_of_later():
@@ -95,6 +105,6 @@ def test_clouds_too_wide_for_their_cells_are_told_of_later():
     body = dispatch.OPERATIONS["radius_outlier_mask"].kernels["cuda"]
     points, ptr = clouds([30], 40, 0.0)
     points[3] = 1e30
-    with asking_later() as flags:
+    with asking_later() as put_off:
         body(points=points, ptr=ptr, min_neighbors=3, radius=1e-3, grid=None)
-    assert any(int(flag) for flag in flags)
+    assert any(int(flag) for flag in put_off.flags)
