@@ -68,7 +68,8 @@ class FixedFrames:
             return None
         data: Any = like
         works = []
-        with torch.no_grad(), asking_later():
+        # What is kept is written to again, in whatever mode of torch a frame comes.
+        with torch.inference_mode(False), torch.no_grad(), asking_later():
             for step in steps:
                 # What a subclass of somebody's does is its own; and hooks want to see what comes and goes.
                 is_ours = type(step).__module__.startswith("pcdata.")
@@ -79,7 +80,7 @@ class FixedFrames:
                     break
                 data = work(data)
                 works.append(work)
-        return cls(steps[: len(works)], works, like) if isinstance(data, FixedRows) else None
+            return cls(steps[: len(works)], works, like) if isinstance(data, FixedRows) else None
 
     def forget(self) -> None:
         """Forget the frame before."""
