@@ -182,6 +182,7 @@ def sampling_cases(points: torch.Tensor, colors: torch.Tensor) -> Iterator[Case]
             lambda: F.farthest_point_sample(points, num_samples=SAMPLES, labels=labels), "fpsample in a loop", by_label,
             lambda a, b: f"{len(a[0])} and {len(b)} picks",
         )  # fmt: skip
+        yield from many_sampling_cases(peer)
     if installed("fpsample") and installed("scipy"):
         from scipy.spatial import cKDTree
 
@@ -195,6 +196,24 @@ def sampling_cases(points: torch.Tensor, colors: torch.Tensor) -> Iterator[Case]
             lambda: F.farthest_point_groups(points, num_samples=SAMPLES), "fpsample and SciPy", peer_groups,
             lambda a, b: f"farthest from its sample: {float(a[3].max()):.4f} and {b.max():.4f} m",
         )  # fmt: skip
+
+
+def many_sampling_cases(one: Callable[[torch.Tensor, int], np.ndarray]) -> Iterator[Case]:
+    """A batch of small clouds, as PointNet++ samples them: a peer that knows no batches has a loop."""
+    clouds, each, number = 128, 3000, 128
+    points = torch.rand(clouds * each, 3, generator=torch.Generator().manual_seed(0))
+    ptr = torch.arange(clouds + 1) * each
+
+    def compare(_: Any, theirs: Any) -> str:
+        start = torch.from_numpy(theirs[:, 0])  # fpsample does not always start where it is told
+        ours = F.farthest_point_sample(points, ptr, num_samples=number, start=start)[0].reshape(clouds, number)
+        return same((ours - ptr[:-1, None]).numpy(), theirs) + " from their starts on"
+
+    yield Case(
+        f"farthest points, {clouds} clouds, {number} of {each} each", len(points),
+        lambda: F.farthest_point_sample(points, ptr, num_samples=number), "fpsample in a loop",
+        lambda: np.stack([one(cloud, number) for cloud in points.split(each)]).astype(np.int64), compare,
+    )  # fmt: skip
 
 
 # -- masks ------------------------------------------------------------------------------------------------------------
