@@ -115,6 +115,11 @@ def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
         "three",
         lambda: ((torch.tensor([50, 0, 4000]), torch.tensor([7, 0, 3900]), torch.tensor([5, 6, 7])), {}),
     )
+    yield (
+        "random_order",
+        "three",
+        lambda: ((torch.tensor([50, 0, 4000]), torch.tensor([7, 0, 3900]), torch.tensor([5, 6, 7])), {}),
+    )
     yield "find_records", "three", lambda: ((_PLACES, *_groups()), {})
     yield "gather_records", "three", _found_records
     yield "inside_box", "random", lambda: ((points(90, 1), (0.05, 0.0, 0.0), (0.15, 0.2, 0.1)), {})

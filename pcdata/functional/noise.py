@@ -124,6 +124,33 @@ def random_rows(counts: Tensor, wanted: Tensor, seeds: Tensor) -> Tensor:
 
 
 @inner
+def random_order(
+    counts: Tensor,  # (B,) int64 rows of each cloud, on the CPU
+    wanted: Tensor,  # (B,) int64, at most those, on the CPU
+    seeds: Tensor,  # (B,) int64, on the CPU
+) -> Tensor:  # (M,) int64 rows of all clouds
+    """Return the first ``wanted`` rows of a random permutation of each cloud's: more of them extend fewer.
+
+    Rows are sorted by the upper half of their word of the cloud's seed; where two are equal, the lower row comes first.
+    """
+    ptr = ptr_from_counts(counts)
+    cloud = cloud_of_rows(ptr)
+    row = torch.arange(len(cloud), dtype=torch.int64, device="cpu") - ptr[cloud]
+    key = (words(seeds[cloud], row) >> 32) & 0xFFFFFFFF
+    order = (cloud << 32 | key).argsort(stable=True)
+    return order[row < wanted[cloud]]  # rows of the sorted lie in their own cloud's places
+
+
+def random_with_repeats(counts: Tensor, wanted: Tensor, seeds: Tensor) -> Tensor:
+    """Return (M,) int64 rows of all clouds, ``wanted`` (B,) of each cloud's ``counts``, each drawn anew; on the CPU."""
+    ptr = ptr_from_counts(wanted)
+    cloud = cloud_of_rows(ptr)
+    number = torch.arange(len(cloud), dtype=torch.int64, device="cpu") - ptr[cloud]
+    drawn = words(seeds[cloud], number) >> 1 & (2**62 - 1)
+    return ptr_from_counts(counts)[cloud] + drawn % counts[cloud].clamp(min=1)
+
+
+@inner
 def dropped_rows(
     keys: Tensor,  # (B,) int64, of streams that begin with word 0, on the CPU
     ptr: Tensor,  # (B+1,) int64, on the CPU

@@ -14,8 +14,9 @@ from pcdata.contracts.on_host import bounds_of, counts_of, on_host, uploaded
 from pcdata.contracts.operators import Traced
 from pcdata.errors import ConfigError, OutOfRangeError, ShapeError
 from pcdata.functional.neighbors import knn
+from pcdata.functional.noise import random_order, random_with_repeats
 from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_from_counts, segment_sum
-from pcdata.rng import seeded, words
+from pcdata.rng import words
 
 # Points per tile in the search for the farthest one; near the square root of a large cloud.
 _TILE = 1024
@@ -210,12 +211,10 @@ def random_sample_index(
     require_rows("random_sample_index", [min(k, 1) for k in wanted] if replace else wanted, ptr)
     if len(seeds) != len(wanted):
         raise ShapeError(f"random_sample_index: {len(seeds)} seeds were given for {len(wanted)} clouds")
-    starts = bounds_of(ptr)
-    drawn = [
-        start + _draw(stop - start, k, seed, replace)
-        for start, stop, k, seed in zip(starts, starts[1:], wanted, seeds.tolist())
-    ]
-    return uploaded(torch.cat(drawn), ptr.device), ptr_from_counts(wanted, device=ptr.device)
+    counts, number = on_host(counts_from_ptr(ptr)), torch.tensor(wanted, dtype=torch.int64, device="cpu")
+    draw = random_with_repeats if replace else random_order
+    rows = draw(counts, number, seeds.to(device="cpu", dtype=torch.int64))
+    return uploaded(rows, ptr.device), ptr_from_counts(wanted, device=ptr.device)
 
 
 def _rows_from_start(where: str, ptr: Tensor, start: Tensor | None, seeds: Tensor | None) -> Tensor | None:
@@ -294,11 +293,3 @@ def _farthest_side_by_side(points: Tensor, begin: Tensor, end: Tensor, count: in
         within = tiles.gather(1, tile[:, None, None].expand(-1, 1, width)).squeeze(1).argmax(dim=1)
         latest = (tile * width + within)[:, None]
     return begin[:, None] + picked
-
-
-def _draw(num_rows: int, count: int, seed: int, replace: bool) -> Tensor:
-    if count == 0:
-        return torch.empty(0, dtype=torch.int64, device="cpu")
-    if replace:
-        return torch.randint(num_rows, (count,), generator=seeded(seed), device="cpu")
-    return torch.randperm(num_rows, generator=seeded(seed), device="cpu")[:count]

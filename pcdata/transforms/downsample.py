@@ -12,13 +12,14 @@ from torch import Tensor
 
 from pcdata.contracts.asked_later import is_set
 from pcdata.contracts.dispatch import roomy_body
-from pcdata.contracts.on_host import bounds_of, counts_of
+from pcdata.contracts.on_host import counts_of
 from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
 from pcdata.functional.fixed_rows import FixedRows
+from pcdata.functional.noise import random_order, random_with_repeats
 from pcdata.functional.rows import cloud_of_rows, group_first, ptr_after_mask, ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample, random_sample_index
 from pcdata.functional.voxels import find_voxel_size, voxel_downsample, voxel_nearest
-from pcdata.rng import Streams, seeded
+from pcdata.rng import Streams
 from pcdata.sensors import SensorProfile
 from pcdata.structures import METRE, PointCloud
 from pcdata.structures.kinds import fillers
@@ -164,13 +165,12 @@ class _Sample(SelectTransform, abstract=True):
         missing = place >= have[cloud]
         if self.if_short == "repeat" and self.is_random:
             # Other streams than those that drew the samples themselves.
-            short = [case for case in zip(counts, wanted, seeds, strict=True) if case[0] < case[1]]
-            drawn = [
-                torch.randint(count, (want - count,), generator=seeded(seed ^ 1), device="cpu")
-                for count, want, seed in short
-            ]
-            place[missing] = torch.cat(drawn)
-        elif self.if_short != "zeros":
+            more = torch.tensor(wanted, dtype=torch.int64, device="cpu") - have
+            others = torch.tensor(seeds, dtype=torch.int64, device="cpu") ^ 1
+            source = ptr_from_counts(counts)[cloud] + place
+            source[missing] = random_with_repeats(have, more, others)
+            return rows[source.to(rows.device)]
+        if self.if_short != "zeros":
             place %= have[cloud]
         source = ptr_from_counts(counts)[cloud] + place
         if self.if_short == "zeros":
@@ -256,6 +256,7 @@ class RandomFarthestPointSample(_FarthestPoints):
     """Sample ``num_points`` points far apart, starting at a random one of each cloud: another covering every time."""
 
     is_random = True
+    version = 2
 
     def starts(self, cloud: PointCloud, seeds: list[int]) -> dict[str, Any]:
         """Return the seeds that the start is drawn from."""
@@ -276,6 +277,7 @@ class RandomSample(_Sample):
 
     is_random = True
     decides_by = "count"
+    version = 2
 
     with_replacement: bool = False
 
@@ -289,14 +291,16 @@ class RandomSample(_Sample):
 
     def sample(self, cloud: PointCloud, counts: list[int], seeds: list[int]) -> Tensor:
         """Take the head of a random permutation of each cloud, or draw each row anew."""
-        rows = []
-        for start, have, count, seed in zip(bounds_of(cloud.ptr), counts_of(cloud.ptr), counts, seeds, strict=False):
-            if self.with_replacement and have != count:  # all that a short cloud has, once
-                drawn = torch.randint(have, (count,), generator=seeded(seed), device="cpu")
-            else:
-                drawn = torch.randperm(have, generator=seeded(seed), device="cpu")[:count]
-            rows.append(drawn.add_(start))
-        return torch.cat(rows).to(cloud.device)
+        have, wanted, own = (
+            torch.tensor(values, dtype=torch.int64, device="cpu") for values in (counts_of(cloud.ptr), counts, seeds)
+        )
+        if self.with_replacement and (counts != counts_of(cloud.ptr)):
+            rows = random_with_repeats(have, wanted, own)
+            whole = have == wanted  # all that a short cloud has, once
+            rows[whole[cloud_of_rows(ptr_from_counts(wanted))]] = random_order(have, torch.where(whole, have, 0), own)
+        else:
+            rows = random_order(have, wanted, own)
+        return rows.to(cloud.device)
 
 
 class RandomShuffle(SelectTransform):
@@ -304,6 +308,7 @@ class RandomShuffle(SelectTransform):
 
     is_random = True
     decides_by = "count"
+    version = 2
 
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Draw a permutation of each cloud."""

@@ -8,10 +8,10 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from pcdata.contracts.on_host import counts_of
+from pcdata.contracts.on_host import uploaded
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.functional.voxels import voxel_cells
-from pcdata.rng import Streams, seeded
+from pcdata.rng import Streams, words
 from pcdata.structures import PointCloud
 from pcdata.transforms.families import SelectTransform
 from pcdata.transforms.field_types import Count, Positive, Unit, Vec3
@@ -43,7 +43,7 @@ class _OnePerVoxel(SelectTransform, abstract=True):
         voxel = _numbered(torch.cat([owner[:, None], cells], dim=1))
         rank = self.ranks(cloud, streams)
         count = int(voxel.max()) + 1 if len(voxel) else 0
-        best = torch.full((count,), cloud.num_points, dtype=torch.int64, device=cloud.device)
+        best = torch.full((count,), torch.iinfo(torch.int64).max, dtype=torch.int64, device=cloud.device)
         best.scatter_reduce_(0, voxel, rank, "amin")
         mask = rank == best[voxel]
         if self.min_points > 1:
@@ -81,15 +81,14 @@ class RandomVoxelSample(_OnePerVoxel):
     """Keep a random point of every occupied voxel of a stated grid (Pointcept's GridSample in training)."""
 
     is_random = True
+    version = 2
 
     def ranks(self, cloud: PointCloud, streams: Streams) -> Tensor:
-        """A random order of the points of each cloud."""
-        counts = counts_of(cloud.ptr)
-        orders = [
-            torch.randperm(count, generator=seeded(seed), device="cpu")
-            for count, seed in zip(counts, streams.seeds().tolist())
-        ]
-        return torch.cat(orders).to(cloud.device)
+        """The words of each cloud's seed, of which no two are equal."""
+        seeds, ptr = uploaded(streams.seeds(), cloud.device), cloud.ptr
+        owner = cloud_of_rows(ptr)
+        row = torch.arange(cloud.num_points, dtype=torch.int64, device=cloud.device) - ptr[owner]
+        return words(seeds[owner], row)
 
 
 def _numbered(cells: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from scipy import stats
 
-from pcdata.functional.noise import move_points, normal_rows, random_rows, standard_normal
+from pcdata.functional.noise import move_points, normal_rows, random_order, random_rows, standard_normal
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.kernels.cpu import unavailable
 from pcdata.rng import Streams, words
@@ -89,3 +89,22 @@ def test_every_row_is_as_likely_to_be_chosen():
     assert stats.chisquare(chosen).pvalue > 1e-3
     pairs = (mask[:, :1] & mask[:, 1:]).sum(dim=0).double().numpy()
     assert stats.chisquare(pairs).pvalue > 1e-3
+
+
+@needs_core
+@pytest.mark.parametrize("size", [1, 60, 3000])
+def test_permutations_by_the_core_are_those_of_the_reference(size):
+    counts = COUNTS * size
+    for wanted in (counts, counts // 2, counts // 5, counts.clamp(max=1), counts.clamp(max=700), 0 * counts):
+        for some in (slice(None), slice(-1, None)):
+            given = counts[some], wanted[some], seeds()[some]
+            assert torch.equal(random_order(*given, backend="cpu"), random_order(*given, backend="torch"))
+
+
+def test_every_permutation_is_as_likely():
+    times = 6000
+    order = random_order(torch.full((times,), 4), torch.full((times,), 4), Streams(range(times)).seeds()).reshape(-1, 4)
+    kinds = ((order % 4) * torch.tensor([64, 16, 4, 1])).sum(1)
+    drawn = kinds.unique(return_counts=True)[1].double().numpy()
+    assert len(drawn) == 24
+    assert stats.chisquare(drawn).pvalue > 1e-3

@@ -28,11 +28,7 @@ LOOPS = {
     "RandomApply": "has steps that loop, and is given to some clouds alone",
     "RandomColorJitter": "kornia adjusts one image at a time",
     "RandomOneOf": "has steps that loop, and is given to some clouds alone",
-    "RandomPointCount": "a permutation is drawn of each cloud",
-    "RandomSample": "a permutation is drawn of each cloud",
     "RandomSensorNoise": "every view has its own camera and sensor",
-    "RandomShuffle": "a permutation is drawn of each cloud",
-    "RandomVoxelSample": "a permutation is drawn of each cloud",
     "RemovePlane": "a cloud has as many planes as it has",
     "Undistort": "every camera has its own lens",
 }

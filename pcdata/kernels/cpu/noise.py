@@ -13,6 +13,8 @@ from pcdata.contracts.dispatch import INNER, kernel
 from pcdata.functional.noise import PointStep
 from pcdata.kernels.cpu.native import call, room, room_for
 
+_MAX_ROWS = 2**32 - 1  # of one cloud; the core numbers them with 32 bits
+
 
 @kernel("move_points", "cpu")
 def move_points(
@@ -71,6 +73,16 @@ def random_rows(counts: Tensor, wanted: Tensor, seeds: Tensor) -> Tensor:
     mask = room(int(counts.sum()), torch.bool)
     call("pc_random_rows", len(counts), counts.contiguous(), wanted.contiguous(), seeds.contiguous(), mask)
     return mask
+
+
+@kernel("random_order", "cpu")
+def random_order(counts: Tensor, wanted: Tensor, seeds: Tensor) -> Tensor:
+    """Sort cloud by cloud; of a cloud of which few are wanted, those alone that may come first."""
+    if len(counts) and int(counts.max()) >= _MAX_ROWS:
+        return INNER["random_order"].reference(counts, wanted, seeds)
+    rows = room(int(wanted.sum()), torch.int64)
+    call("pc_random_order", len(counts), counts.contiguous(), wanted.contiguous(), seeds.contiguous(), rows)
+    return rows
 
 
 @kernel("dropped_rows", "cpu")

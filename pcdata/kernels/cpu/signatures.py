@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x13E575FE2025A08
+INTERFACE_NUMBER = 0x133722D8ECA3B51
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -39,6 +39,7 @@ pc_led_back: double* matrices, int64 num_steps, int64 num_clouds, double* source
     possible
 pc_are_plain_motions: double* matrices, int64 count, int64* plain
 pc_random_rows: int64 num_clouds, int64* counts, int64* wanted, int64* seeds, uint8* mask
+pc_random_order: int64 num_clouds, int64* counts, int64* wanted, int64* seeds, int64* rows
 pc_dropped_rows: int64* keys, int64* ptr, int64 num_clouds, double low, double high, uint8* mask, int64* kept_ptr
 pc_inside_box: float* points, int64 rows, float* lower, float* upper, uint8* inside, int64* finite
 pc_box_mask: float* points, int64* ptr, int64 num_clouds, float* lower, float* upper, uint8* inside
