@@ -68,6 +68,41 @@ def depth_image(height: int = 60, width: int = 80, seed: int = 0) -> tuple[Tenso
     return torch.from_numpy(points), ImageGrid(torch.from_numpy(v * width + u), (height, width), intrinsics)
 
 
+def uneven_surfaces(count: int) -> Tensor:
+    """Two planes and a crowd of points, with an edge, a thinned-out part and strays, row after row."""
+    side = torch.linspace(0, 1, int(count**0.5))
+    x, y = (axis.reshape(-1) for axis in torch.meshgrid(side, side, indexing="ij"))
+    points = torch.stack([x, y, 0.2 * (x > 0.5)], 1) + 1e-4 * normal(len(x))
+    points[-len(x) // 50 :] *= 3.0
+    points[:: len(x) // 60, 2] += 0.05 * torch.arange(1, 1 + len(points[:: len(x) // 60]))
+    return torch.cat([points, normal(count // 20, 1, 0.002)])
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+@pytest.mark.parametrize(("count", "neighbors"), [(12_000, 5), (12_000, 40), (20_000, 16), (20_000, 300)])
+def test_points_in_no_order_get_the_mask_of_the_reference(count, neighbors, threads):
+    torch.set_num_threads(threads)
+    points = uneven_surfaces(count)
+    for radius in (0.003, 0.01, 0.03):
+        wanted = radius_outlier_mask(points, min_neighbors=neighbors, radius=radius, backend="torch_tree")
+        assert wanted.any()
+        for order in (torch.arange(len(points)), torch.randperm(len(points), generator=torch.manual_seed(0))):
+            mask = radius_outlier_mask(points[order], min_neighbors=neighbors, radius=radius, backend="cpu")
+            assert torch.equal(mask, wanted[order])
+
+
+@pytest.mark.parametrize("neighbors", [5, 16])
+def test_a_large_cloud_in_no_order_gets_the_mask_of_the_same_points_in_order(neighbors):
+    points = uneven_surfaces(600_000)  # so many that a few pieces tell that they are in no order
+    order = torch.randperm(len(points), generator=torch.manual_seed(0))
+    masks = [
+        radius_outlier_mask(some, min_neighbors=neighbors, radius=0.01, backend="cpu")
+        for some in (points, points[order])
+    ]
+    assert 0 < int(masks[0].sum()) < len(points) // 10
+    assert torch.equal(masks[0][order], masks[1])
+
+
 def test_both_operations_have_a_compiled_kernel():
     assert "cpu" in OPERATIONS["radius_outlier_mask"].kernels
     assert OPERATIONS["dbscan"].serves("cpu")

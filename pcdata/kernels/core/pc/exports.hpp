@@ -157,8 +157,9 @@ PC_EXPORT int32_t pc_are_plain_motions(const pc_context* context, const double* 
 PC_EXPORT int32_t pc_random_rows(const pc_context* context, int64_t num_clouds, const int64_t* counts,
                                  const int64_t* wanted, const int64_t* seeds, uint8_t* mask);
 
-// rows (sum of wanted,): the first wanted (clouds,) rows of a permutation of each cloud's counts (clouds,) rows, at most
-// 2^32 - 1, sorted by the upper halves of the words of its seed and then by themselves; rows are those of all clouds.
+// rows (sum of wanted,): the first wanted (clouds,) rows of a permutation of each cloud's counts (clouds,) rows, at
+// most 2^32 - 1, sorted by the upper halves of the words of its seed and then by themselves; rows are those of all
+// clouds.
 PC_EXPORT int32_t pc_random_order(const pc_context* context, int64_t num_clouds, const int64_t* counts,
                                   const int64_t* wanted, const int64_t* seeds, int64_t* rows);
 

@@ -6,11 +6,12 @@
 // 2. What is left (depth edges, strays) needs only the points around it, picked by a bitmap of coarse blocks of space.
 // 3. Those are sorted into cells; a cell with enough points decides itself, other points count the cells around them.
 //
-// Points in no order skip to the third step.
+// Of points in no order cells that hold enough points are found by counting first, and others looked for among some.
 #include <iterator>
 
 #include "pc/bounds.hpp"
 #include "pc/cells/block_bitmap.hpp"
+#include "pc/cells/cell_counts.hpp"
 #include "pc/cells/neighborhood.hpp"
 
 namespace pc::cells {
@@ -176,6 +177,45 @@ Pick pick_around_marked(const pc_context& context, ScratchFrame& scratch, const 
   return {rows, count};
 }
 
+// One point in sixteen, and the marked ones: in a crowded place even so few show that a point is not alone.
+Pick pick_some_and_marked(ScratchFrame& scratch, const RadiusSearch& search) {
+  constexpr int64_t kRun = 16, kEvery = 16 * kRun;
+  uint32_t* rows = scratch.take<uint32_t>(search.count);
+  int64_t count = 0;
+  for (int64_t i = 0; i < search.count; ++i) {
+    rows[count] = static_cast<uint32_t>(i);
+    count += (i % kEvery < kRun) | search.outlier[i];
+  }
+  return {rows, count};
+}
+
+// Mark what has few neighbors before and after it in memory; returns how many points those are.
+int64_t mark_by_sequence(const pc_context& context, const RadiusSearch& search) {
+  // Twice as many points as are needed; beyond this, cells are quicker.
+  constexpr int64_t kMostClose = 16;
+  const int64_t close = search.enough / 2 + 1;
+  const int wide = std::min<int>(kMostAround, static_cast<int>(8 * close));
+  const auto mark = [&](int64_t begin, int64_t end) {
+    return search_sequence(search, begin, end, static_cast<int>(close), wide);
+  };
+  // Whether points are in an order shows in some of the pieces.
+  constexpr int64_t kTried = 32, kPiecesPerTry = 16;
+  bool in_order = close <= kMostClose && search.count < kTried * kPiecesPerTry * kPiece;
+  if (!in_order && close <= kMostClose) {
+    for (int64_t t = 0; t < kTried && !in_order; ++t) {
+      const int64_t begin = search.count / kTried * t;
+      in_order = 2 * mark(begin, begin + kPiece) <= kPiece;
+    }
+  }
+  if (!in_order) {
+    std::fill(search.outlier, search.outlier + search.count, uint8_t{1});
+    return search.count;
+  }
+  std::atomic<int64_t> marked{0};
+  parallel_for(context, search.count, kPiece, [&](int64_t begin, int64_t end, int64_t) { marked += mark(begin, end); });
+  return marked;
+}
+
 // Decide one cloud; returns its largest cell coordinate, and decides nothing when that is too large.
 double search_cloud(const pc_context& context, const RadiusSearch& search) {
   ScratchFrame scratch;
@@ -184,28 +224,33 @@ double search_cloud(const pc_context& context, const RadiusSearch& search) {
   const double largest = largest_coordinate(box, side);
   if (largest >= kMostCellsPerAxis) return largest;
 
-  // Twice as many points as are needed; beyond this, cells are quicker.
-  constexpr int64_t kMostClose = 16;
-  std::atomic<int64_t> marked{0};
-  if (const int64_t close = search.enough / 2 + 1; close <= kMostClose) {
-    const int wide = std::min<int>(kMostAround, static_cast<int>(8 * close));
-    parallel_for(context, search.count, kPiece, [&](int64_t begin, int64_t end, int64_t) {
-      marked += search_sequence(search, begin, end, static_cast<int>(close), wide);
-    });
-  } else {
-    marked = search.count;
-    std::fill(search.outlier, search.outlier + search.count, uint8_t{1});
-  }
+  int64_t marked = mark_by_sequence(context, search);
   if (marked == 0) return largest;
 
-  constexpr int64_t kFew = 8;  // picking pays while fewer than one point in this many is marked
-  Pick pick{nullptr, search.count};
-  if (marked < search.count / kFew) pick = pick_around_marked(context, scratch, search, box, marked);
+  constexpr int64_t kFew = 8;     // picking pays while fewer than one point in this many is marked
+  constexpr int64_t kSome = 128;  // a look at some of the points first pays from here on
+  constexpr int64_t kManyPoints = 1 << 13;
   const Lattice lattice(box, side);
-  if (lattice.fits_narrow())
-    search_cells<NarrowKey>(context, scratch, search, lattice, pick.rows, pick.count);
-  else
-    search_cells<WideKey>(context, scratch, search, lattice, pick.rows, pick.count);
+  const auto search_among = [&](Pick pick) {
+    if (lattice.fits_narrow())
+      search_cells<NarrowKey>(context, scratch, search, lattice, pick.rows, pick.count);
+    else
+      search_cells<WideKey>(context, scratch, search, lattice, pick.rows, pick.count);
+  };
+  const bool many = search.count >= kManyPoints;
+  if (many && marked >= search.count / kFew)
+    marked = clear_crowded(context, lattice, search.points, search.count, search.enough, search.outlier);
+  if (marked == 0) return largest;
+  if (marked >= search.count / kFew) {
+    search_among({nullptr, search.count});
+    return largest;
+  }
+  if (many && marked > search.count / kSome) {
+    search_among(pick_some_and_marked(scratch, search));
+    marked = std::count(search.outlier, search.outlier + search.count, uint8_t{1});
+    if (marked == 0) return largest;
+  }
+  search_among(pick_around_marked(context, scratch, search, box, marked));
   return largest;
 }
 

@@ -142,7 +142,10 @@ Cells<Key> sort_into_cells(const pc_context& context, ScratchFrame& scratch, con
   parallel_for(context, num_pieces, 1, [&](int64_t p, int64_t, int64_t) {
     int64_t cell = cells_before[p], place = points_before[p];
     for (int64_t r = pieces[p].begin; r < pieces[p].end; ++r) {
-      if (rows == nullptr && r + kAhead < num_runs) __builtin_prefetch(points + 3 * int64_t{runs[r + kAhead].first});
+      if (r + kAhead < num_runs) {
+        const uint32_t next = runs[r + kAhead].first;
+        __builtin_prefetch(points + 3 * int64_t{rows == nullptr ? next : rows[next]});
+      }
       if (opens_cell(r)) {
         key[cell] = runs[r].key;
         start[cell++] = static_cast<uint32_t>(place);
