@@ -1,5 +1,5 @@
 // The beginnings of random permutations of the rows of many clouds.
-#include "pc/noise/normal.hpp"
+#include "pc/math/random.hpp"
 #include "pc/sort/radix.hpp"
 
 namespace pc::noise {
@@ -19,7 +19,7 @@ struct DrawnRow {
 };
 
 uint32_t drawn_key(uint64_t seed, int64_t row) {
-  return static_cast<uint32_t>(word(seed, static_cast<uint64_t>(row)) >> 32);
+  return static_cast<uint32_t>(math::random_word(seed, static_cast<uint64_t>(row)) >> 32);
 }
 
 // The rows of a cloud that come first, in any order, a few more than wanted: those of the lowest bins of keys.
