@@ -163,7 +163,7 @@ class BlockProjector {
       for (int64_t u = first_u; u <= last_u; u += kLanes) {
         const auto depth = load<FloatRegister>(view_.depth + std::min(v * view_.width + u, pixels - kLanes));
         const RegisterMask read = less(FloatRegister{}, depth);
-        high = maximum(high, select(read, depth, FloatRegister{}));
+        high = maximum(depth, high);
         low = minimum(low, select(read, depth, none));
       }
     return {lowest_lane<float>(low), highest_lane<float>(high)};
