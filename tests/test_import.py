@@ -42,18 +42,19 @@ print(json.dumps(sorted(set(sys.modules) - before)))
 def test_transforms_are_imported_in_a_blink():
     # Compiling to bytecode is not what is measured: the first process does it, conftest.py lets it keep what it made.
     code = """
-import time
+import gc, time
 start = time.process_time()
 import torch
+gc.disable()  # to go through all that torch has made takes longer than half of what is measured here
 loaded = time.process_time()
 import pcdata, pcdata.transforms
 print(loaded - start, time.process_time() - loaded)
 """
     # Beside torch, which has to come first: a slow or busy machine is slow for both. One quick import is proof enough.
     times = []
-    while len(times) < 4 and not any(ours < torchs / 5 for torchs, ours in times):
+    while len(times) < 4 and not any(ours < torchs / 6 for torchs, ours in times):
         times.append(tuple(map(float, in_a_new_process(code).split())))
-    assert any(ours < torchs / 5 for torchs, ours in times), times
+    assert any(ours < torchs / 6 for torchs, ours in times), times
 
 
 def test_every_public_name_resolves():

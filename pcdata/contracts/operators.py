@@ -13,7 +13,16 @@ from typing import Any
 import torch
 from torch import Tensor
 
-_LIBRARY = torch.library.Library("pcdata", "DEF")
+
+def _own_library() -> torch.library.Library | None:
+    try:
+        return torch.library.Library("pcdata", "DEF")
+    except RuntimeError:
+        return None
+
+
+# None in a second copy of pcdata in one process: the operators are the first one's, and of this one programs are cut.
+_LIBRARY = _own_library()
 # Of arguments in schemas: what they may be in a call.
 _TYPES: dict[str, tuple[type, ...]] = {
     "Tensor": (Tensor,),
@@ -41,6 +50,8 @@ class Traced:
 
     def register(self, name: str, call: Callable[..., Any], *, gradient: bool) -> Callable[..., Any]:
         """Make the operator; return what a traced program calls: its results, or None where it cannot take the call."""
+        if _LIBRARY is None:
+            return lambda *_: None
         pairs = [one.split(" ") for one in self.arguments.split(", ")]
         types = {own: _TYPES[kind] for kind, own in pairs}
         order = tuple(types)

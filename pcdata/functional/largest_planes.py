@@ -6,6 +6,7 @@ import functools
 
 import numpy as np
 import torch
+from numpy.random import RandomState
 from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
@@ -48,7 +49,7 @@ def words_drawn(seed: int, count: int, device: torch.device) -> Tensor | None:
     Torch's generator is the Mersenne Twister that NumPy has too (Matsumoto & Nishimura, ACM TOMACS 8(1), 1998). None
     where this version of torch draws otherwise.
     """
-    state = np.random.RandomState(seeded(seed).initial_seed() & 0xFFFFFFFF)
+    state = RandomState(seeded(seed).initial_seed() & 0xFFFFFFFF)
     words = state.randint(0, 1 << 32, size=(3, count), dtype=np.uint32).astype(np.int64)
     for size in _TRIED:
         first, second, third = (row % (size - taken) for taken, row in enumerate(words))

@@ -27,7 +27,8 @@ CUDA = """
 #define __device__
 #define __forceinline__ inline
 double sqrt(double), fabs(double), fma(double, double, double), nan(const char*);
-float fabsf(float);
+float fabsf(float), sqrtf(float), ceilf(float), rintf(float), __uint_as_float(unsigned int);
+unsigned int __float_as_uint(float);
 """
 
 

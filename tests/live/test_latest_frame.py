@@ -121,7 +121,7 @@ def test_a_pipeline_follows_a_camera_through_a_stall(scene):
 def test_a_slow_pipeline_drops_and_never_goes_back(scene, monkeypatch):
     live = LivePipeline(pcdata.Compose([pcdata.Deproject()]), like=scene)
     run = live._run
-    monkeypatch.setattr(live, "_run", lambda frame: (time.sleep(0.03), run(frame))[1])
+    monkeypatch.setattr(live, "_run", lambda *given: (time.sleep(0.03), run(*given))[1])
     numbers = itertools.count()
 
     def read():

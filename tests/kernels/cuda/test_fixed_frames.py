@@ -84,7 +84,7 @@ def test_a_step_without_fixed_shapes_ends_what_is_captured(device):
     assert list(live.stats().latency) == ["whole", "MaskDepth + Deproject + RemoveRadiusOutliers", "VoxelDownsample"]
 
 
-class KeepsEvenRows(T.RemoveRadiusOutliers):
+class KeepsEvenRows(T.RemoveRadiusOutliers, abstract=True):
     """Somebody's step, made of one that could be captured."""
 
     def pick(self, cloud, streams):

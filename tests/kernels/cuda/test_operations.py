@@ -97,6 +97,7 @@ def test_every_kernel_is_run_by_some_operation():
     F.statistical_outlier_mask(torch.rand(90, 3), num_neighbors=40, backend=harness.BACKEND)
     F.estimate_normals(torch.rand(90, 3), max_neighbors=40, backend=harness.BACKEND)
     F.farthest_point_sample(torch.rand(33_000, 3), num_samples=2, backend=harness.BACKEND)  # all blocks for one cloud
+    F.farthest_point_sample(torch.rand(33_000, 4), num_samples=2, backend=harness.BACKEND)  # in four columns
     many, ptr = torch.rand(17_000, 3, generator=seeded(0)), torch.tensor([0, 17_000])  # some of them are searched
     largest_planes(many, ptr, distance=0.1, num_hypotheses=5, seed=0, probability=0.9, backend=harness.BACKEND)
     ran |= set(launcher.started)
