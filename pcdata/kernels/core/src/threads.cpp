@@ -3,30 +3,33 @@
 
 #include <chrono>
 #include <condition_variable>
+#include <memory>
 #include <mutex>
 #include <new>
 #include <thread>
 
-#if defined(__linux__)
+#if !defined(_WIN32)
 #include <pthread.h>
+#endif
+#if defined(__linux__)
 #include <sched.h>
 #endif
 
 namespace pc {
 namespace {
 
-// Helpers of the thread that made it, from the first job until the end of the call: between calls no thread lives that
-// a fork could break. A kernel has several short jobs, so helpers wait for the next one awake, for a while; and a job
+// Helpers of the thread that made it. Starting one takes as long as a short kernel, so they live on for a while after a
+// call, for the next one. A kernel has several short jobs, so helpers wait for the next one awake at first; and a job
 // never waits for a helper that has not come yet, because starting a thread may take a millisecond.
 class ThreadTeam {
  public:
-  ThreadTeam() : outer_(current()) { current() = this; }
+  ThreadTeam() = default;
   ThreadTeam(const ThreadTeam&) = delete;
   ThreadTeam& operator=(const ThreadTeam&) = delete;
   ~ThreadTeam() {
-    current() = outer_;
     wake(kQuit);
-    for (auto& helper : helpers_) helper.join();
+    for (auto& helper : helpers_)
+      if (helper->thread.joinable()) helper->thread.join();
   }
 
   // The team of the call that this thread is in; null in helpers.
@@ -54,23 +57,39 @@ class ThreadTeam {
   static constexpr uint64_t kQuit = 1, kNext = 2;  // what to add to signal_
   static constexpr uint32_t kClosed = uint32_t{1} << 31;
   static constexpr int kLooks = 20000;  // some tens of microseconds
+  static constexpr std::chrono::milliseconds kStays{50};
+
+  struct Helper {
+    std::thread thread;
+    std::atomic<bool> is_gone{false};
+  };
 
   void start_helpers(int64_t wanted) {
+    size_t first_new = helpers_.size();
     try {
-      while (static_cast<int64_t>(helpers_.size()) < wanted) {
-        const auto thread = static_cast<int64_t>(helpers_.size()) + 1;
-        helpers_.emplace_back([this, thread, seen = signal_.load()] { serve(thread, seen); });
-        move_elsewhere(helpers_.back());
+      for (int64_t i = 0; i < wanted; ++i) {
+        if (i == static_cast<int64_t>(helpers_.size())) helpers_.push_back(std::make_unique<Helper>());
+        Helper& helper = *helpers_[static_cast<size_t>(i)];
+        if (helper.is_gone.load() && helper.thread.joinable()) helper.thread.join();
+        if (helper.thread.joinable()) continue;
+        helper.is_gone.store(false);
+        helper.thread = std::thread([this, &helper, i, seen = signal_.load()] { serve(helper, i + 1, seen); });
+        first_new = std::min(first_new, static_cast<size_t>(i));
       }
     } catch (...) {
       // No more threads to be had: the ones there are do the work.
     }
+    keep_elsewhere(first_new);
   }
 
-  void serve(int64_t thread, uint64_t seen) {
+  void serve(Helper& helper, int64_t thread, uint64_t seen) {
+#if defined(__linux__)
+    pthread_setname_np(pthread_self(), "pcdata");
+#endif
     for (;;) {
-      seen = next_signal(seen);
-      if (seen & kQuit) return;
+      const uint64_t now = next_signal(seen);
+      if (now == seen || (now & kQuit)) return helper.is_gone.store(true);
+      seen = now;
       // A job that is over, or being replaced, is closed: nothing of it is read then.
       if (!(present_.fetch_add(1) & kClosed) && thread < wanted_) work_(object_, thread);
       present_.fetch_sub(1);
@@ -84,33 +103,41 @@ class ThreadTeam {
     wake_.notify_all();
   }
 
+  // The next signal; or the same again, when none came for long.
   uint64_t next_signal(uint64_t seen) {
     for (int look = 0; look < kLooks; ++look)
       if (const uint64_t now = signal_.load(); now != seen) return now;
     std::unique_lock<std::mutex> lock(mutex_);
     asleep_.fetch_add(1);
-    wake_.wait(lock, [&] { return signal_.load() != seen; });
+    wake_.wait_for(lock, kStays, [&] { return signal_.load() != seen; });
     asleep_.fetch_sub(1);
     return signal_.load();
   }
 
-  // Left to itself, Linux often starts a thread on its maker's processor, where it waits for the maker to pause.
-  static void move_elsewhere(std::thread& helper) {
+  // Left to itself, Linux often runs a thread on the processor of who starts or wakes it, where it waits for that one
+  // to pause: keep helpers where this thread may run, but is not.
+  void keep_elsewhere(size_t first_new) {
 #if defined(__linux__)
-    cpu_set_t allowed, others;
+    cpu_set_t allowed;
     const int here = sched_getcpu();
     if (here < 0 || sched_getaffinity(0, sizeof(allowed), &allowed) != 0) return;
-    others = allowed;
-    CPU_CLR(here, &others);
-    if (CPU_COUNT(&others) == 0) return;
-    pthread_setaffinity_np(helper.native_handle(), sizeof(others), &others);
-    pthread_setaffinity_np(helper.native_handle(), sizeof(allowed), &allowed);  // free to go where it likes from there
+    const bool is_known = here == here_ && CPU_EQUAL(&allowed, &allowed_);
+    here_ = here;
+    allowed_ = allowed;
+    if (CPU_COUNT(&allowed) > 1) CPU_CLR(here, &allowed);
+    for (size_t i = is_known ? first_new : 0; i < helpers_.size(); ++i)
+      if (helpers_[i]->thread.joinable())
+        pthread_setaffinity_np(helpers_[i]->thread.native_handle(), sizeof(allowed), &allowed);
 #else
-    (void)helper;
+    (void)first_new;
 #endif
   }
 
-  std::vector<std::thread> helpers_;
+#if defined(__linux__)
+  int here_ = -1;
+  cpu_set_t allowed_{};
+#endif
+  std::vector<std::unique_ptr<Helper>> helpers_;
   std::mutex mutex_;
   std::condition_variable wake_;
   std::atomic<uint64_t> signal_{0};
@@ -119,8 +146,56 @@ class ThreadTeam {
   void (*work_)(void*, int64_t) = nullptr;
   void* object_ = nullptr;
   int64_t wanted_ = 0;
+};
+
+// The team of a call, while it lasts.
+class InTeam {
+ public:
+  explicit InTeam(ThreadTeam& team) : outer_(ThreadTeam::current()) { ThreadTeam::current() = &team; }
+  InTeam(const InTeam&) = delete;
+  InTeam& operator=(const InTeam&) = delete;
+  ~InTeam() { ThreadTeam::current() = outer_; }
+
+ private:
   ThreadTeam* outer_;
 };
+
+#if !defined(_WIN32)  // where a library that is unloaded must not wait for threads
+// The team that a thread keeps. None lives where the process forks: its helpers would be missing in the child, and who
+// forks may ask that there is one thread alone.
+struct KeptTeam {
+  std::unique_ptr<ThreadTeam> team;
+
+  static ThreadTeam& of_this_thread() {
+    KeptTeam& kept = mine();
+    if (kept.team == nullptr) {
+      static const bool ended_by_forks = end_by_forks();
+      (void)ended_by_forks;
+      kept.team = std::make_unique<ThreadTeam>();
+    }
+    return *kept.team;
+  }
+
+ private:
+  static KeptTeam& mine() {
+    static thread_local KeptTeam kept;
+    return kept;
+  }
+  static bool end_by_forks() {
+    // From within a call, which polls Python, it lives on: it is at work. The child can neither use nor end it.
+    const auto before = [] {
+      if (ThreadTeam::current() == nullptr) mine().team.reset();
+    };
+    const auto in_child = [] { static_cast<void>(mine().team.release()); };
+    return pthread_atfork(before, nullptr, in_child) == 0;
+  }
+};
+#endif
+
+void run_in(ThreadTeam& team, void* body, void (*call)(void*)) {
+  const InTeam in_team(team);
+  call(body);
+}
 
 constexpr int64_t kBetweenPolls = 20'000'000;  // nanoseconds
 
@@ -133,8 +208,14 @@ int64_t now() {
 
 int32_t run_call(void* body, void (*call)(void*)) noexcept {
   try {
-    ThreadTeam team;
-    call(body);
+#if !defined(_WIN32)
+    if (ThreadTeam::current() == nullptr) {
+      run_in(KeptTeam::of_this_thread(), body, call);
+      return kOk;
+    }
+#endif
+    ThreadTeam own;  // within a call, by what it polls, the kept team is at work
+    run_in(own, body, call);
     return kOk;
   } catch (const std::bad_alloc&) {
     return kOutOfMemory;
