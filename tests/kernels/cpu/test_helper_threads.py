@@ -64,6 +64,11 @@ for _ in range(100):
         break
     time.sleep(0.05)
 assert not helpers(), "helpers wait for ever"
+allowed = os.sched_getaffinity(0)
+for wait in (0.0, 0.02, 0.049, 0.0495, 0.05, 0.0502, 0.051, 0.06) * 4:  # about as long as helpers wait
+    time.sleep(wait)
+    assert call() == expected
+    assert os.sched_getaffinity(0) == allowed, "a helper that has gone took the caller from its processors"
 os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 assert call() == expected
 """

@@ -88,7 +88,10 @@ class ThreadTeam {
 #endif
     for (;;) {
       const uint64_t now = next_signal(seen);
-      if (now == seen || (now & kQuit)) return helper.is_gone.store(true);
+      if (now == seen || (now & kQuit)) {
+        std::lock_guard<std::mutex> lock(mutex_);
+        return helper.is_gone.store(true);
+      }
       seen = now;
       // A job that is over, or being replaced, is closed: nothing of it is read then.
       if (!(present_.fetch_add(1) & kClosed) && thread < wanted_) work_(object_, thread);
@@ -125,8 +128,11 @@ class ThreadTeam {
     here_ = here;
     allowed_ = allowed;
     if (CPU_COUNT(&allowed) > 1) CPU_CLR(here, &allowed);
-    for (size_t i = is_known ? first_new : 0; i < helpers_.size(); ++i)
-      if (helpers_[i]->thread.joinable())
+    const size_t first = is_known ? first_new : 0;
+    if (first >= helpers_.size()) return;
+    std::lock_guard<std::mutex> lock(mutex_);  // none goes meanwhile: for a thread that has ended glibc moves this one
+    for (size_t i = first; i < helpers_.size(); ++i)
+      if (helpers_[i]->thread.joinable() && !helpers_[i]->is_gone.load())
         pthread_setaffinity_np(helpers_[i]->thread.native_handle(), sizeof(allowed), &allowed);
 #else
     (void)first_new;
