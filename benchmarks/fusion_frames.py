@@ -5,7 +5,7 @@
 benchmarks/fusion.py starts this once per row: threads are fixed when a process starts, and memory can be told apart
 only where one library is at work alone. Frames are read and converted to each library's types before any clock starts;
 the first frame is left out of the medians, as it pays for what is made once. Open3D's tensor grid gets room for
-the blocks that it will need, so that it never has to copy them to grow.
+the blocks that it will need, so that it never has to copy them to grow; so does pcdata with --reserve.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from typing import Any
 import torch
 from fusion_agreement import edges_by_cause, surfaces_apart
 from fusion_memory import Growth
+from fusion_page import GROWING
 from fusion_peer import LegacyVolume, Open3DGrid, Open3DView, positions, room_for, write_frames
 from torch import Tensor
 
@@ -33,7 +34,7 @@ from pcdata.functional.tsdf import Carving
 from pcdata.structures import DepthFrame, TSDFVolume
 
 _WAIT = 0.03  # seconds: OpenMP threads spin for 10 ms after they have worked
-LIBRARIES = ("pcdata", "pcdata, no carving", "Open3D tensor", "Open3D legacy")
+LIBRARIES = ("pcdata", GROWING, "pcdata, no carving", "Open3D tensor", "Open3D legacy")
 
 
 class Library(ABC):
@@ -76,15 +77,30 @@ class Library(ABC):
 class Ours(Library):
     """pcdata's volume."""
 
-    def __init__(self, frames: Sequence[DepthFrame], voxel_size: float, multiple: float, carve: Carving) -> None:
+    def __init__(
+        self, frames: Sequence[DepthFrame], voxel_size: float, multiple: float, carve: Carving, reserve: bool
+    ) -> None:
         super().__init__()
         self._frames = frames
+        self._reserve = reserve
         self._lengths = {"voxel_size": voxel_size, "truncation": multiple * voxel_size}
         self._carve = carve
 
     def start(self) -> None:
-        """Make the empty volume."""
-        self._volume = TSDFVolume(**self._lengths, carve=self._carve, max_bytes=16 << 30)
+        """Make the empty volume, with the memory that it will need if it is to have it beforehand."""
+        needed = self._filled().num_bytes if self._reserve else 0
+        self._volume = self._empty()
+        if needed:
+            self._volume.reserve(needed)
+
+    def _empty(self) -> TSDFVolume:
+        return TSDFVolume(**self._lengths, carve=self._carve, max_bytes=16 << 30)
+
+    def _filled(self) -> TSDFVolume:
+        volume = self._empty()
+        for frame in self._frames:
+            volume.integrate(frame)
+        return volume
 
     def _integrate(self, number: int) -> None:
         self._volume.integrate(self._frames[number])
@@ -160,8 +176,11 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=50)
     parser.add_argument("--voxel-size", type=float, required=True)
     parser.add_argument("--multiple", type=float, default=5.0, help="truncation in voxels")
-    parser.add_argument("--libraries", nargs="+", choices=LIBRARIES, default=LIBRARIES[:3])
+    parser.add_argument("--libraries", nargs="+", choices=LIBRARIES, default=LIBRARIES[:4])
     parser.add_argument("--legacy-python")
+    parser.add_argument(
+        "--reserve", action="store_true", help="give pcdata its memory beforehand, unless it grows"
+    )
     parser.add_argument("--agreement", action="store_true", help="compare the surfaces of pcdata and the tensor grid")
     parser.add_argument("--memory", action="store_true", help="watch the peak; give one library")
     parser.add_argument("--again", action="store_true", help="time a second pass over the frames: no new ground")
@@ -207,14 +226,17 @@ def library(name: str, frames: Sequence[DepthFrame], arguments: argparse.Namespa
         return Theirs(frames, *lengths)
     if name == "Open3D legacy":
         return Legacy(frames, *lengths, arguments.legacy_python)
-    return Ours(frames, *lengths, carve="never" if name == "pcdata, no carving" else "near")
+    carve: Carving = "never" if name == "pcdata, no carving" else "near"
+    return Ours(frames, *lengths, carve, reserve=arguments.reserve and name != GROWING)
 
 
 def agreement(frames: Sequence[DepthFrame], used: dict[str, Library], voxel_size: float) -> dict[str, Any]:
     theirs = used["Open3D tensor"]
     assert isinstance(theirs, Theirs)
     apart = {
-        name: surfaces_apart(one.cloud, theirs.cloud, voxel_size) for name, one in used.items() if isinstance(one, Ours)
+        name: surfaces_apart(one.cloud, theirs.cloud, voxel_size)
+        for name, one in used.items()
+        if isinstance(one, Ours) and name != GROWING  # whose cloud is that of pcdata
     }
     causes = edges_by_cause(used["pcdata, no carving"].cloud, theirs.cloud, theirs.grid, frames, theirs.views)
     return {"apart": apart, "causes": causes}

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 PAGE = Path(__file__).parents[1] / "docs" / "fusion.md"
+GROWING = "pcdata, growing"  # without room beforehand, where pcdata has it
 CAUSES = {
     "same": "the same readings",
     "free": "free space too",

@@ -61,6 +61,7 @@ class TSDFVolume:
     frame_id: str | None = None
     num_views: int = field(default=0, init=False)
     blocks: tsdf.VoxelBlocks | None = field(default=None, init=False, repr=False)
+    room: tsdf.VoxelRoom = field(init=False, repr=False)  # that the blocks lie in
     _kept_rays: dict[tuple[float, ...], tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -71,6 +72,7 @@ class TSDFVolume:
             raise ConfigError(f"TSDFVolume: max_bytes must be at least 1, got {self.max_bytes}")
         self.device = torch.device(self.device)
         self.truncation = self.grid.truncation
+        self.room = tsdf.VoxelRoom(self.device)
 
     @property
     def grid(self) -> tsdf.VoxelGrid:
@@ -87,6 +89,11 @@ class TSDFVolume:
         """The memory that the blocks take."""
         return 0 if self.blocks is None else len(self.blocks) * tsdf.bytes_per_block(self.blocks.planes)
 
+    @property
+    def reserved_bytes(self) -> int:
+        """The memory that blocks can take before the volume asks the system for more."""
+        return self.room.num_bytes
+
     # -- in --------------------------------------------------------------------------------------------------------
 
     def integrate(self, frame: DepthFrame) -> None:
@@ -98,21 +105,49 @@ class TSDFVolume:
         Raises:
             FrameError: the frame has no poses, or they lead to another frame.
             CaptureError: it has other images than the first one.
-            VolumeTooLargeError: the blocks it needs would exceed ``max_bytes``; nothing was allocated.
+            VolumeTooLargeError: the blocks it needs would exceed ``max_bytes``, and nothing was allocated; or the
+                system has no memory for them.
             DeviceError: it is on another device.
             UnitError: a reading lies 2^20 blocks or more from the origin.
         """
         blocks, views, found, new = self._located(frame)
         self._check_room(frame, len(new))
-        if self.blocks is None:
-            self.frame_id = frame.frame_id
-            self.blocks = blocks
         blocks.add(new)
+        self.frame_id, self.blocks = frame.frame_id, blocks
         for view, rows in zip(views, found, strict=True):
             if self.carve == "everywhere":
                 rows = torch.arange(len(blocks), dtype=torch.int64, device=frame.device)
             tsdf.integrate_view(blocks, rows, view, self.grid, carve=self.carve != "never", backend=self.backend)
         self.num_views += len(views)
+
+    def reserve(self, num_bytes: int) -> None:
+        """Take memory for the volume now, so that frames which need no more of it never wait for the system.
+
+        ``num_bytes`` counts all blocks, those that are there too, as :attr:`num_bytes` and :meth:`estimate_bytes` do;
+        less than there is changes nothing. The memory is written to once, in pages of 2 MB where the system has
+        them, and nothing that is stored is moved, now or later. On a GPU up to 64 MiB more are taken.
+
+        Raises:
+            ConfigError: ``num_bytes`` is not a whole number of at least 1.
+            VolumeTooLargeError: it is more than ``max_bytes``, or than the device has.
+        """
+        if type(num_bytes) is not int or num_bytes < 1:
+            raise ConfigError(f"TSDFVolume.reserve: num_bytes must be a whole number from 1 on, got {num_bytes!r}")
+        if num_bytes > self.max_bytes:
+            raise VolumeTooLargeError(
+                f"TSDFVolume.reserve: {num_bytes / 2**20:.1f} MiB are more than max_bytes allows, "
+                f"{self.max_bytes / 2**20:.1f} MiB; ask for less, or allow more"
+            )
+        self.room.reserve(num_bytes)
+
+    def clear(self) -> None:
+        """Forget all views and keep the memory, so that the next ones find it there.
+
+        What the first frame decided stays: the coordinate frame, and whether there are colors and labels.
+        """
+        if self.blocks is not None:
+            self.blocks.clear()
+        self.num_views = 0
 
     def estimate_bytes(self, frame: DepthFrame) -> int:
         """Return the memory that the blocks would take with this frame, without allocating any; exact.
@@ -127,7 +162,9 @@ class TSDFVolume:
         """Return the blocks, the views of a frame that fits, the rows of their blocks, and the keys to add first."""
         self._check_frame(frame)
         views = [self._view(frame, index) for index in range(frame.num_views)]
-        blocks = tsdf.VoxelBlocks(self._planes_of(frame), frame.device) if self.blocks is None else self.blocks
+        blocks = self.blocks
+        if blocks is None:
+            blocks = tsdf.VoxelBlocks(self._planes_of(frame), frame.device, room=self.room)
         return blocks, views, *tsdf.locate_views(blocks, views, self.grid, backend=self.backend)
 
     def _check_room(self, frame: DepthFrame, new: int) -> None:
@@ -249,7 +286,7 @@ class TSDFVolume:
         return 1 if self.weighting == "constant" else UNIT_WEIGHT
 
     def _surface(self, min_weight: float, *, edges: bool) -> tsdf.Crossings:
-        if self.blocks is None:
+        if self.blocks is None or self.num_views == 0:
             raise ConfigError("TSDFVolume: nothing was integrated yet")
         least = self._least_weight(min_weight)
         return tsdf.find_crossings(self.blocks, self.grid, min_weight=least, edges=edges, backend=self.backend)

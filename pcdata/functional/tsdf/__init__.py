@@ -4,6 +4,7 @@ from pcdata.functional.tsdf.blocks import VoxelBlocks, bytes_per_block, voxel_pl
 from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.integrate import find_blocks, integrate_view, locate_views, touched_blocks
 from pcdata.functional.tsdf.marching import find_triangles
+from pcdata.functional.tsdf.room import VoxelRoom
 from pcdata.functional.tsdf.surface import Crossings, find_crossings
 from pcdata.functional.tsdf.views import (
     Carving,
@@ -21,6 +22,7 @@ __all__ = [
     "FusionView",
     "VoxelBlocks",
     "VoxelGrid",
+    "VoxelRoom",
     "Weighting",
     "bytes_per_block",
     "check_labels",

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
-import mmap
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from pcdata.contracts.fields import Fields
 from pcdata.functional.tsdf.grid import VOXELS
+from pcdata.functional.tsdf.room import VoxelRoom
 
 CHUNK = 8192  # blocks
 TSDF_SCALE = 32767  # of a stored distance: one truncation. Rounding costs 1e-5 of it, at most, per view
@@ -48,30 +46,18 @@ def bytes_per_block(planes: Planes) -> int:
     return VOXELS * sum(dtype.itemsize for dtype in planes.values())
 
 
-def _empty_chunk(planes: Planes, device: torch.device) -> Chunk:
-    """Reserve the voxels of ``CHUNK`` blocks, all zero; on the CPU a page, of 2 MB if possible, waits for its writing.
+def _chunk(planes: Planes, memory: Tensor) -> Chunk:
+    """Lay out ``CHUNK`` blocks in their memory, uint8.
 
     The planes of one block lie behind one another, so that a block is one stretch of memory: with color, a page.
     """
-    room = _zeros(CHUNK * bytes_per_block(planes), device).reshape(CHUNK, -1)
+    of_blocks = memory.reshape(CHUNK, -1)
     found, start = {}, 0
     for name, dtype in planes.items():
         end = start + VOXELS * dtype.itemsize
-        found[name] = room[:, start:end].view(dtype)
+        found[name] = of_blocks[:, start:end].view(dtype)
         start = end
     return found
-
-
-def _zeros(count: int, device: torch.device) -> Tensor:
-    if device.type != "cpu":
-        return torch.zeros(count, dtype=torch.uint8, device=device)
-    if not hasattr(mmap, "MADV_HUGEPAGE"):
-        return torch.from_numpy(np.zeros(count, np.uint8))
-    # A volume grows by tens of megabytes per view: page faults of 4 KB would take longer than filling these.
-    pages = mmap.mmap(-1, count, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
-    with contextlib.suppress(OSError):  # advice only: a system may be built without huge pages
-        pages.madvise(mmap.MADV_HUGEPAGE)
-    return torch.frombuffer(pages, dtype=torch.uint8)
 
 
 @dataclass(eq=False)
@@ -84,13 +70,15 @@ class VoxelBlocks:
     table: Tensor | None = None  # of hashed keys; kernels make it and keep it up to date
     in_table: int = 0  # rows that the table has
     addresses: Tensor | None = None  # of the chunks; kernels of a GPU make it
+    room: VoxelRoom | None = None  # that chunks are cut from; None = one of their own
     _count: int = field(default=0, init=False)
-    _room: Tensor = field(init=False, repr=False)  # for keys; doubled when full
+    _keys: Tensor = field(init=False, repr=False)  # and room for more; doubled when full
     _sorted: tuple[Tensor, Tensor] = field(init=False, repr=False)  # keys, rows of the blocks there were at some time
 
     def __post_init__(self) -> None:
-        self._room = torch.empty(0, dtype=torch.int64, device=self.device)
-        self._sorted = self._room, self._room
+        self.room = VoxelRoom(self.device) if self.room is None else self.room
+        self._keys = torch.empty(0, dtype=torch.int64, device=self.device)
+        self._sorted = self._keys, self._keys
 
     def __len__(self) -> int:
         return self._count
@@ -98,7 +86,13 @@ class VoxelBlocks:
     @property
     def keys(self) -> Tensor:
         """The keys (B,) int64 in the order of appearance."""
-        return self._room[: self._count]
+        return self._keys[: self._count]
+
+    @property
+    def capacity(self) -> int:
+        """How many blocks there is memory for."""
+        assert self.room is not None
+        return self.room.num_bytes // bytes_per_block(self.planes)
 
     @property
     def sorted_keys(self) -> Tensor:
@@ -111,16 +105,33 @@ class VoxelBlocks:
         return self._merged()[1]
 
     def add(self, keys: Tensor) -> None:
-        """Open blocks for sorted, distinct keys that have none."""
+        """Open blocks for sorted, distinct keys that have none.
+
+        Raises:
+            VolumeTooLargeError: the system has no memory for them; none was opened.
+        """
+        assert self.room is not None
         count = self._count + len(keys)
-        if count > len(self._room):
-            room = self._room.new_empty(max(count, 2 * len(self._room)))
-            room[: self._count] = self.keys
-            self._room = room
-        self._room[self._count : count] = keys
-        self._count = count
         while len(self.chunks) * CHUNK < count:
-            self.chunks.append(_empty_chunk(self.planes, self.device))
+            self.chunks.append(_chunk(self.planes, self.room.take(CHUNK * bytes_per_block(self.planes))))
+        if count > len(self._keys):
+            more = self._keys.new_empty(max(count, 2 * len(self._keys), self.capacity))
+            more[: self._count] = self.keys
+            self._keys = more
+        self._keys[self._count : count] = keys
+        self._count = count
+
+    def clear(self) -> None:
+        """Close all blocks and keep their memory, all zero again."""
+        for number, chunk in enumerate(self.chunks):
+            for plane in chunk.values():
+                plane[: max(0, self._count - number * CHUNK)].zero_()
+        self._count, self.in_table, self.table = 0, 0, None
+        self._sorted = self._keys[:0], self._keys[:0]
+
+    def table_size(self, fewest: int) -> int:
+        """Return how many places a table needs to find the blocks, half of them empty once there is no more room."""
+        return max(fewest, 1 << (2 * max(2 * self._count, self.capacity) - 1).bit_length())
 
     def find(self, keys: Tensor) -> Tensor:
         """Return the (N,) row of every key, -1 where there is no block."""

@@ -38,7 +38,7 @@ def write_volume(path: str | os.PathLike[str], volume: TSDFVolume) -> None:
         ConfigError: nothing was integrated yet.
         CacheError: the file cannot be written; what was there before stays.
     """
-    if volume.blocks is None:
+    if volume.blocks is None or volume.num_views == 0:
         raise ConfigError("write_volume: nothing was integrated yet")
     blocks = volume.blocks
     about = {name: getattr(volume, name) for name in _FIELDS}
@@ -108,7 +108,7 @@ def _loaded(where: str, archive: ZipArchive, max_bytes: int, device: str) -> TSD
     keys = read_array(archive, archive.members["keys.npy"])
     if len(np.unique(keys)) != len(keys) or (len(keys) and keys.min() < 0):
         raise CacheError("block keys must be distinct and not negative")
-    blocks = VoxelBlocks(planes, torch.device(device))
+    blocks = VoxelBlocks(planes, torch.device(device), room=volume.room)
     order = np.argsort(keys)
     blocks.add(torch.from_numpy(keys[order]).to(device))
     rows = np.empty_like(order)
@@ -154,7 +154,7 @@ def _write_plane(archive: zipfile.ZipFile, name: str, blocks: VoxelBlocks) -> No
     with archive.open(f"{name}.npy", "w", force_zip64=True) as stream:
         np.lib.format.write_array_header_1_0(stream, header)
         for number, chunk in enumerate(blocks.chunks):
-            plane = chunk[name][: len(blocks) - number * CHUNK]
+            plane = chunk[name][: max(0, len(blocks) - number * CHUNK)]
             stream.write(plane.cpu().numpy().astype(dtype, copy=False).tobytes())
 
 

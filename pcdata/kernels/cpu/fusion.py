@@ -59,7 +59,7 @@ def pack_colors(colors: Tensor) -> Tensor:
 def find_blocks(blocks: VoxelBlocks, keys: Tensor) -> tuple[Tensor, Tensor]:
     """Ask a hash table of the rows, which learns here of the blocks added since the last time."""
     if blocks.table is None or 2 * len(blocks) > len(blocks.table):
-        slots = max(_FEWEST_SLOTS, 1 << (4 * len(blocks) - 1).bit_length())
+        slots = blocks.table_size(_FEWEST_SLOTS)
         blocks.table, blocks.in_table = torch.from_numpy(np.full(slots, -1, np.int32)), 0
     rows, missing, count = room(keys.shape, torch.int64), room(keys.shape, torch.int64), room(1, torch.int64)
     table = (blocks.keys, len(blocks), blocks.table, len(blocks.table), blocks.in_table)

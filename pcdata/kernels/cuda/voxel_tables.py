@@ -31,7 +31,7 @@ def row_table(launcher: Launcher, blocks: VoxelBlocks) -> tuple[Any, ...]:
     if count == 0:
         return None, None, 0, 0
     if blocks.table is None or 2 * count > len(blocks.table):
-        size = max(_FEWEST_PLACES, 1 << (4 * count - 1).bit_length())
+        size = blocks.table_size(_FEWEST_PLACES)
         blocks.table, blocks.in_table = torch.full((size,), -1, dtype=torch.int32, device=blocks.device), 0
     size = len(blocks.table)
     table = blocks.keys, blocks.table, size - 1, 65 - size.bit_length()

@@ -282,6 +282,25 @@ def test_on_a_device_a_frame_waits_once_and_a_surface_once(carve, monkeypatch):
 
 
 @pretends
+def test_a_device_reserves_and_clears_as_the_host_does(monkeypatch):
+    device = harness.as_on_a_gpu(monkeypatch)
+    frames = [random_frame((5, 7), 0.4, seed, lens=False, images=True) for seed in range(3)]
+    volume = TSDFVolume(voxel_size=0.03, device=device)
+    volume.reserve(40 << 20)
+    reserved = volume.reserved_bytes
+    assert reserved >= 40 << 20
+    volume.integrate(frames[0].to(device))
+    volume.clear()
+    for frame in frames[1:]:
+        volume.integrate(frame.to(device))
+    assert volume.reserved_bytes == max(reserved, volume.reserved_bytes)
+    here = TSDFVolume(voxel_size=0.03, backend="torch")
+    for frame in frames[1:]:
+        here.integrate(frame)
+    assert_same(here.extract_points(), volume.extract_points().to("cpu"), tolerance=3e-7)
+
+
+@pretends
 def test_views_of_one_capture_wait_once_together(monkeypatch):
     device = harness.as_on_a_gpu(monkeypatch)
     frame = tabletop_frame(3)
