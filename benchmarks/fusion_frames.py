@@ -178,9 +178,7 @@ def main() -> None:
     parser.add_argument("--multiple", type=float, default=5.0, help="truncation in voxels")
     parser.add_argument("--libraries", nargs="+", choices=LIBRARIES, default=LIBRARIES[:4])
     parser.add_argument("--legacy-python")
-    parser.add_argument(
-        "--reserve", action="store_true", help="give pcdata its memory beforehand, unless it grows"
-    )
+    parser.add_argument("--reserve", action="store_true", help="give pcdata its memory beforehand, unless it grows")
     parser.add_argument("--agreement", action="store_true", help="compare the surfaces of pcdata and the tensor grid")
     parser.add_argument("--memory", action="store_true", help="watch the peak; give one library")
     parser.add_argument("--again", action="store_true", help="time a second pass over the frames: no new ground")
