@@ -46,6 +46,9 @@ def _depth_filters() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     yield "temporal_step", "values", lambda: ((depth, None, last, seen, 0.4, 0.01, 3), {})
     yield "temporal_step", "reciprocals", lambda: ((depth, scale, last, seen, 0.4, 0.1, 5), {})
     yield "without_flying_pixels", "confidence", lambda: ((depth, seen % 4, 0.02, 3), {})
+    yield "without_flying_pixels", "masked", lambda: ((depth, None, 0.02, 3, (0.5, 0.9, seen > 99)), {})
+    yield "look_at_depth", "same", lambda: ((depth, depth.clone()), {})
+    yield "look_at_depth", "other", lambda: ((depth, last), {})
     yield "fill_rows", "three", lambda: ((depth, 3), {})
     yield "filled_images", "farthest", lambda: ((depth, "farthest", 4, 1), {})
     yield "filled_confidence", "two", lambda: ((depth, last, seen % 4, seen > 99), {})
@@ -196,6 +199,7 @@ def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     values = torch.rand(126, generator=seeded(4), dtype=torch.float64)
     yield "window_medians", "two", lambda: ((values, cloud, ptr, None), {})
     yield "window_medians", "on a grid", _medians
+    yield "facing_normals", "one place", lambda: ((cloud, cloud.flip(0), torch.tensor([[0.1, 0.2, 0.3]])), {})
     yield "hull_rows", "two", lambda: ((cloud[:, :2].double(),), {})
     places = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 0.9]], dtype=torch.float64)
     yield "reaches", "two", lambda: ((cloud, ptr, places, 0.01), {})

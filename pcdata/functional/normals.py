@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import op
+from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.host import all_finite
 from pcdata.contracts.known import FINITE, is_known
 from pcdata.contracts.numbers import checked_count, checked_length
@@ -101,8 +101,14 @@ def orient_normals(
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
     """
     _check_viewpoint(points, normals, viewpoint)
-    facing = (normals.double() * (viewpoint.double() - points.double())).sum(-1, keepdim=True)
-    return torch.where(facing < 0, -normals, normals)
+    return facing_normals(points, normals, viewpoint)
+
+
+@inner
+def facing_normals(points: Tensor, normals: Tensor, viewpoint: Tensor) -> Tensor:
+    """Run the body of :func:`orient_normals`; the product is (x + y) + z."""
+    x, y, z = (normals.double() * (viewpoint.double() - points.double())).unbind(-1)
+    return torch.where(((x + y) + z < 0)[:, None], -normals, normals)
 
 
 def _check_viewpoint(points: Tensor, normals: Tensor, viewpoint: Tensor) -> None:

@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-import torch
-from torch import Tensor
-
 from pcdata.errors import CaptureError, FrameError, IntrinsicsError, NonFiniteError, ShapeError
 from pcdata.io.sources.still_camera import same_camera
 from pcdata.structures import DepthFrame
@@ -46,30 +42,15 @@ def check_like(frame: DepthFrame, like: DepthFrame) -> None:
         )
 
 
-def has_readings(depth: Tensor, extremes: tuple[float, float] | None = None) -> bool:
-    """Say whether a pixel is not 0; ``extremes``: the least and the largest where they are known.
+def has_readings(least: float, largest: float) -> bool:
+    """Say whether a pixel is not 0, given the least and the largest depth.
 
     Raises:
         NonFiniteError: NaN or infinite depth, which a capture cannot be made with, but changed to.
         CaptureError: negative depth.
     """
-    if extremes is not None:
-        least, largest = extremes
-    elif depth.device.type == "cpu":  # NaN is the least and the largest wherever there is one
-        values = depth.detach().numpy()
-        least, largest = float(values.min()), float(values.max())
-    else:
-        least, largest = torch.stack(depth.aminmax()).tolist()
     if not math.isfinite(least) or not math.isfinite(largest):
         raise NonFiniteError("LivePipeline: depth has NaN or infinite values; 0 is the only mark for 'no reading'")
     if least < 0:
         raise CaptureError(f"LivePipeline: depth has negative values, down to {least:g} m")
     return largest > 0
-
-
-def same_pixels(depth: Tensor, other: Tensor) -> bool:
-    """Say whether two images of one shape hold the same values; a few rows of them tell mostly."""
-    if depth.device.type != "cpu":
-        return torch.equal(depth, other)
-    one, two, step = depth.detach().numpy(), other.numpy(), max(1, depth.shape[1] // 8)
-    return np.array_equal(one[:, ::step], two[:, ::step]) and np.array_equal(one, two)

@@ -25,9 +25,10 @@ from pcdata.errors import (
     PoseError,
     ShapeError,
 )
+from pcdata.functional.depth.looks import look_at_depth
 from pcdata.live.arrays import ArrayReader
 from pcdata.live.faults import Fault, LiveResult, StalledError
-from pcdata.live.first_frame import check_like, has_readings, same_pixels
+from pcdata.live.first_frame import check_like, has_readings
 from pcdata.live.fixed_frames import FixedFrames, Seen
 from pcdata.live.kept_memory import keep_freed_memory
 from pcdata.live.latency import Histogram
@@ -115,7 +116,7 @@ class LivePipeline:
         self._stamps = Stamps(max_age, clock)
         self._camera: LatestFrame | None = None
         self._last: Tensor | None = None
-        self._copy: Tensor | None = None
+        self._copies: list[Tensor] = []  # two at most, used in turns
         self._turn = Lock()  # held while a frame is worked on
         self._names = [type(step).__name__ for step in self.chain.steps]
         self._number = 0
@@ -190,18 +191,19 @@ class LivePipeline:
             else:
                 frame = self._arrays.frame(given, colors, confidence, pose, keep=self._last)
             seen = None if self._fixed is None else self._looked_at(frame)
-            is_empty = not has_readings(frame.depth, None if seen is None else (seen.least, seen.largest))
+            # Nobody else writes to depth that was made of an array.
+            copy = self._room_for_copy(frame.depth) if self._same_pixels and seen is None and frame is given else None
+            looked = seen or look_at_depth(frame.depth, self._last if self._same_pixels else None, copy)
+            is_empty = not has_readings(looked.least, looked.largest)
         except Exception as error:
             fault = next((fault for kind, fault in _KINDS if isinstance(error, kind)), Fault.OTHER_FORM)
             return None, fault, str(error)
         if is_empty:
             return None, Fault.EMPTY, "LivePipeline: not one pixel has a reading; is the lens covered?"
-        if self._same_pixels and (
-            seen.is_same if seen is not None else self._last is not None and same_pixels(frame.depth, self._last)
-        ):
+        if self._same_pixels and looked.is_same:
             return None, Fault.FROZEN, "LivePipeline: every pixel is that of the frame before; does the camera stream?"
         if self._same_pixels and seen is None:
-            self._remember(frame.depth, is_own=frame is not given)
+            self._last = frame.depth if copy is None else copy  # what the next frame is held to
         try:
             if self.before is not None:
                 since = time.perf_counter()
@@ -217,15 +219,13 @@ class LivePipeline:
             self._arrays.give_away(_tensors_of(cloud))
         return cloud, None, ""
 
-    def _remember(self, depth: Tensor, *, is_own: bool) -> None:
-        """Keep the pixels for the next frame: as they are where nobody else writes to them, else copied."""
-        if is_own:
-            self._last = depth
-            return
-        if self._copy is None or self._copy.shape != depth.shape or self._copy.device != depth.device:
-            self._copy = torch.empty_like(depth, memory_format=torch.contiguous_format)
-        self._copy.copy_(depth)
-        self._last = self._copy
+    def _room_for_copy(self, depth: Tensor) -> Tensor:
+        """Return memory for depth that does not hold the frame before."""
+        for room in self._copies:
+            if room is not self._last:
+                return room
+        self._copies.append(torch.empty_like(depth, memory_format=torch.contiguous_format, requires_grad=False))
+        return self._copies[-1]
 
     def _looked_at(self, frame: DepthFrame) -> Seen | None:
         """Run the captured steps on a frame; None where there are none, or a filter comes before them."""
@@ -263,7 +263,10 @@ class LivePipeline:
         return cloud
 
     def _count(self, name: str, seconds: float) -> None:
-        self._passes.setdefault(name, Histogram()).add(seconds)
+        taken = self._passes.get(name)
+        if taken is None:
+            taken = self._passes[name] = Histogram()
+        taken.add(seconds)
 
     def follow(self, camera: LatestFrame) -> Iterator[LiveResult]:
         """Answer the newest frame of a camera, again and again, until it ends the stream.

@@ -149,10 +149,10 @@ class _Sample(SelectTransform, abstract=True):
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Select the rows and blank those marked -1."""
+        if self.if_short != "zeros":  # no other way marks rows
+            return data.select(params["index"], params["ptr"])
         blank = params["index"] < 0
         chosen = data.select(params["index"].clamp(min=0), params["ptr"])
-        if self.if_short != "zeros":
-            return chosen
         fields = chosen.fields()
         filler = fillers(fields, chosen.kinds)
         return chosen.with_fields(**{name: _blanked(value, blank, filler[name]) for name, value in fields.items()})

@@ -1,8 +1,8 @@
-"""The usual beginning of a chain as one pass over the pixels: MaskDepth, Deproject, ToFrame, CropWorkspace.
+"""The usual beginning of a chain in one go: MaskDepth, RemoveFlyingPixels, Deproject, ToFrame, CropWorkspace.
 
-Between these steps lie two clouds of every pixel, and filling fresh memory with them takes longer than all arithmetic.
-:class:`Compose` therefore runs them together when nobody looks in between. The cloud, its history and its provenance
-are those of the single steps, bit for bit; and whatever they would refuse is left to them.
+Between these steps lie an image and two clouds of every pixel, and filling fresh memory with them takes longer than all
+arithmetic. :class:`Compose` therefore runs them together when nobody looks in between. The cloud, its history and its
+provenance are those of the single steps, bit for bit; and whatever they would refuse is left to them.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from pcdata.contracts.known import FINITE, note
 from pcdata.contracts.on_host import counts_of, read_together
 from pcdata.errors import PcdataError
 from pcdata.functional.depth.deproject import Deprojected, deproject_into_box
+from pcdata.functional.depth.flying_pixels import without_flying_pixels
 from pcdata.functional.image_grid import pixels_rise
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.structures.image_layout import pixels_of_views
@@ -23,12 +24,14 @@ from pcdata.structures.structure import derived
 from pcdata.transforms.base import Data, Params, Transform
 from pcdata.transforms.crop import CropWorkspace
 from pcdata.transforms.deproject import Deproject, MaskDepth
+from pcdata.transforms.depth_filters import RemoveFlyingPixels
+from pcdata.transforms.families import MaskTransform
 from pcdata.transforms.frames import ToFrame
 from pcdata.transforms.fused_selections import SetAside, are_many, looked_at
 
 
 def find_beginning(steps: Sequence[Transform]) -> slice | None:
-    """Return where [MaskDepth,] Deproject, [ToFrame,] CropWorkspace stand in a chain; None if they do not."""
+    """Return where [MaskDepth,] [RemoveFlyingPixels,] Deproject, [ToFrame,] CropWorkspace stand, or None."""
     # Exact types: a subclass may do something else.
     kinds = [type(step) for step in steps]
     if Deproject not in kinds:
@@ -40,10 +43,11 @@ def find_beginning(steps: Sequence[Transform]) -> slice | None:
     crop = steps[stop] if stop < len(steps) else None
     if type(crop) is not CropWorkspace or not crop.is_plain:
         return None
-    mask = steps[start - 1] if start else None
-    # A limit to what the mask may remove needs its readings counted.
-    if type(mask) is MaskDepth and mask.max_drop is None:
-        start -= 1
+    # A limit to what a step may remove needs its readings counted.
+    for kind in (RemoveFlyingPixels, MaskDepth):
+        before = steps[start - 1] if start else None
+        if isinstance(before, MaskTransform) and type(before) is kind and before.max_drop is None:
+            start -= 1
     return slice(start, stop + 1)
 
 
@@ -69,15 +73,23 @@ def _run(
     steps: Sequence[Transform], frame: DepthFrame, needed: Collection[str] | None
 ) -> tuple[PointCloud, SetAside | None] | None:
     by_type = {type(step): step for step in steps}
-    mask, deproject, move, crop = map(by_type.get, (MaskDepth, Deproject, ToFrame, CropWorkspace))
+    mask, flying, deproject, move, crop = map(
+        by_type.get, (MaskDepth, RemoveFlyingPixels, Deproject, ToFrame, CropWorkspace)
+    )
     assert isinstance(deproject, Deproject)
     assert isinstance(crop, CropWorkspace)
     assert not isinstance(crop.lower, str)  # is_plain
     assert not isinstance(crop.upper, str)
-    near = far = region = None
+    depth, limits = frame.depth, None
     if isinstance(mask, MaskDepth):
-        near, far, region = mask.near, mask.far, mask.mask_of(frame)
+        limits = mask.near, mask.far, mask.mask_of(frame)
         frame = mask.recorded(frame, frame, {})
+    if isinstance(flying, RemoveFlyingPixels):
+        # The confidence of what is kept stays.
+        depth, _ = without_flying_pixels(depth, None, flying.tolerance, flying.min_neighbors, limits)
+        limits = None
+        frame = flying.recorded(frame, frame, {})
+    near, far, region = limits or (None, None, None)
     images, colors = deproject.images_of(frame), frame.colors
     aside = None
     if needed is not None and are_many(frame.depth.numel()):
@@ -95,7 +107,7 @@ def _run(
     crop.check_input(moved)
     matrix = moves.get("matrix")
     done = deproject_into_box(
-        frame.depth,
+        depth,
         *deproject.cameras_of(frame),
         colors,
         images,

@@ -59,7 +59,8 @@ class EstimateNormals(Transform):
             data.points, data.ptr, radius=self.radius, max_neighbors=self.max_neighbors, grid=data.image_grid()
         )
         if self.orient == "viewpoint":
-            viewpoint = data.viewpoint_per_point()
+            is_one = data.num_clouds == 1 and "viewpoint" not in data.extra
+            viewpoint = data.viewpoint if is_one else data.viewpoint_per_point()
             if viewpoint is None:
                 raise FrameError(
                     "EstimateNormals: the cloud has no viewpoint to face; set PointCloud.viewpoint to where the sensor "

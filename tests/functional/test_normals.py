@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import ConfigError, DTypeError, ShapeError
-from pcdata.functional.normals import _smallest_eigenvector, estimate_normals, orient_normals
+from pcdata.functional.normals import _smallest_eigenvector, estimate_normals, facing_normals, orient_normals
 from pcdata.geometry.rigid import angle_between
 
 
@@ -104,6 +104,19 @@ def test_orient_normals_faces_the_viewpoint_and_keeps_edge_on_normals():
     assert torch.equal(orient_normals(points, normals, torch.zeros(1, 3)), expected)
     per_point = torch.tensor([[0.0, 0, 0], [0, 0, 5], [-9, 0, 1]])
     assert torch.equal(orient_normals(points, normals, per_point), torch.tensor([[0.0, 0, -1], [0, 0, 1], [-1, 0, 0]]))
+
+
+@pytest.mark.parametrize("count", [0, 1, 5, 40_000])
+def test_kernels_turn_what_the_reference_turns(count: int):
+    points, normals = torch.randn((2, count, 3), generator=torch.Generator().manual_seed(count))
+    points[::3] = normals[::3] * 0.0  # seen edge-on from the origin
+    for viewpoint in (torch.zeros(1, 3), points.flip(0) + 1, torch.ones(3).double()):
+        turned = facing_normals(points, normals, viewpoint)
+        assert torch.equal(turned, facing_normals(points, normals, viewpoint, backend="torch"))
+        assert turned.dtype is torch.float32
+    asked = normals.clone().requires_grad_()
+    orient_normals(points, asked, torch.zeros(3)).sum().backward()
+    assert asked.grad is not None
 
 
 @pytest.mark.parametrize("backend", ["auto", "torch"])

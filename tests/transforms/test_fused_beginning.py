@@ -12,7 +12,15 @@ import torch
 from pcdata.contracts.dispatch import why_unavailable
 from pcdata.structures import Camera, DepthFrame, PointCloud
 from pcdata.synthetic import tabletop
-from pcdata.transforms import Compose, CropWorkspace, Deproject, MaskDepth, RandomJitter, ToFrame
+from pcdata.transforms import (
+    Compose,
+    CropWorkspace,
+    Deproject,
+    MaskDepth,
+    RandomJitter,
+    RemoveFlyingPixels,
+    ToFrame,
+)
 from pcdata.transforms import fused_beginning as fused
 from tests.factories import assert_same, frame_with_counts
 
@@ -33,6 +41,15 @@ CHAINS: dict[str, list[Any]] = {
     "crop": [Deproject(), IN_CAMERA],
     "mask, crop": [MaskDepth(near=0.3, far=1.2), Deproject(), IN_CAMERA],
     "mask, move, crop": [MaskDepth(far=1.4, drop_labels=[0]), Deproject(), ToFrame(frame="base"), IN_BASE],
+    "flying, crop": [RemoveFlyingPixels(tolerance=0.01), Deproject(), IN_CAMERA],
+    "mask, flying, move, crop": [
+        MaskDepth(near=0.3, far=1.4, min_confidence="completed"),
+        RemoveFlyingPixels(min_neighbors=5),
+        Deproject(),
+        ToFrame(frame="base"),
+        IN_BASE,
+    ],
+    "flying, mask": [RemoveFlyingPixels(), MaskDepth(far=1.2), Deproject(), IN_CAMERA],
     "trusted only": [MaskDepth(min_confidence="reliable"), Deproject(), IN_CAMERA],
     "moved by a matrix": [
         MaskDepth(use_mask=False),
@@ -107,6 +124,7 @@ def refusals() -> dict[str, tuple[list[Any], DepthFrame]]:
             FULL,
         ),
         "everything masked": ([MaskDepth(near=50.0), Deproject(), IN_CAMERA], FULL),
+        "everything masked before": ([MaskDepth(near=50.0), RemoveFlyingPixels(), Deproject(), IN_CAMERA], FULL),
     }
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.depth.deproject import Deprojected, check_intrinsics
+from pcdata.functional.depth.looks import DepthLook
 from pcdata.kernels.cameras import Rays, depth_limits, images_fit, rays_of_cameras, region_fits
 from pcdata.kernels.cpu.native import addresses, call, numbers, room, room_for
 
@@ -28,6 +29,18 @@ def mask_depth(depth: Tensor, near: float | None, far: float | None, mask: Tenso
     limits = depth_limits(near, far)
     call("pc_mask_depth", depth.contiguous(), depth.numel(), *limits, _contiguous(mask), masked)
     return masked
+
+
+@kernel("look_at_depth", "cpu")
+def look_at_depth(depth: Tensor, before: Tensor | None = None, copy: Tensor | None = None) -> DepthLook:
+    """Read, compare and copy in one pass; it compares until the first difference."""
+    for other in (before, copy):
+        if other is not None and (other.shape != depth.shape or other.dtype is not torch.float32):
+            raise ValueError(f"look_at_depth: {tuple(other.shape)} {other.dtype} beside {tuple(depth.shape)}")
+    extremes, same = room(2, torch.float32), room(1, torch.int64)
+    call("pc_look_at_depth", depth.contiguous(), depth.numel(), _contiguous(before), copy, extremes, same)
+    least, largest = extremes.tolist()
+    return DepthLook(least, largest, bool(same.item()))
 
 
 @kernel("deproject_depth", "cpu")

@@ -16,6 +16,7 @@ from torch import Tensor
 import pcdata.functional.clusters
 import pcdata.functional.neighbor_index
 import pcdata.functional.neighborhoods
+import pcdata.functional.normals
 import pcdata.functional.outliers  # noqa: F401
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.image_grid import ImageGrid
@@ -253,6 +254,18 @@ def estimate_normals(
     most = _reachable(max_neighbors, points)
     call("pc_normals", points, ptr, len(ptr) - 1, most, _limit(radius), *_grid_arguments(grid), normals)
     return normals
+
+
+@kernel("facing_normals", "cpu")
+def facing_normals(points: Tensor, normals: Tensor, viewpoint: Tensor) -> Tensor:
+    """Turn them in one pass; another dtype than float32 is the reference's."""
+    if any(one.dtype is not torch.float32 for one in (points, normals, viewpoint)):
+        found: Tensor = INNER["facing_normals"].reference(points, normals, viewpoint)
+        return found
+    facing, of_all = room(normals.shape, torch.float32), viewpoint.numel() == 3
+    arrays = points.contiguous(), normals.contiguous(), points.shape[0], viewpoint.contiguous()
+    call("pc_face_normals", *arrays, of_all, facing)
+    return facing
 
 
 @kernel("neighborhood_shapes", "cpu")

@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x133722D8ECA3B51
+INTERFACE_NUMBER = 0xCFF13242676710D
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -15,6 +15,7 @@ pc_deproject: float* depth, int64 views, int64 height, int64 width, float* colum
     double* matrices, uint8* keep, int64* starts, float* points, int64* pixel_index, int64 over_all_views, uint8* rgb,
     float* colors, int64 num_copied, int64* sources, int64* pixel_bytes, int64* copies
 pc_mask_depth: float* depth, int64 count, double near, double far, uint8* mask, float* masked
+pc_look_at_depth: float* depth, int64 count, float* before, float* copy, float* extremes, int64* same
 pc_register_depth: float* depth, int64 views, int64 height, int64 width, float* column_rays, float* row_rays, float*
     rays, double* color_from_depth, double* color_intrinsics, double* half_pixels, double* lenses, int64 color_height,
     int64 color_width, double max_jump, float* registered, int64* pixel_index, uint8* occluding, uint8* hidden, int64*
@@ -62,8 +63,8 @@ pc_fill_rows: float* values, int64 rows, int64 width, int64 radius, float* fille
 pc_filled_confidence: float* before, float* after, int64 count, uint8* confidence, uint8* far, uint8* filled_confidence,
     int64* any_filled
 pc_flying_pixels: float* depth, int64 num_views, int64 height, int64 width, double tolerance, int64 least, uint8* flying
-pc_without_flying_pixels: float* depth, int64 num_views, int64 height, int64 width, double tolerance, int64 least,
-    uint8* confidence, float* kept, uint8* kept_confidence
+pc_without_flying_pixels: float* depth, int64 num_views, int64 height, int64 width, int64 is_masked, double near, double
+    far, uint8* mask, double tolerance, int64 least, uint8* confidence, float* kept, uint8* kept_confidence
 pc_window_medians: float* values, int64* pixel, int64* ptr, int64 num_clouds, int64 height, int64 width, float* medians
 pc_linked_pixels: float* points, int64* pixel, int64* ptr, int64 num_clouds, int64 height, int64 width, double limit,
     int64 reach, int64* label
@@ -102,6 +103,7 @@ pc_neighborhood_shapes: float* points, int64 num_points, int64* index, int64 num
     float* mean, double* covariance, int64* counts
 pc_normals: float* points, int64* ptr, int64 num_clouds, int64 max_neighbors, double limit, int64* pixel, int64 width,
     double* camera, float* normals
+pc_face_normals: float* points, float* normals, int64 count, float* viewpoint, int64 one_for_all, float* facing
 pc_statistical_outliers: float* points, int64* ptr, int64 num_clouds, int64 num_neighbors, double std_ratio, int64*
     pixel, int64 width, double* camera, double* mean, bool* outlier
 pc_radius_outlier_mask: float* points, int64* ptr, int64 clouds, double radius, int64 min_neighbors, int64* pixel, int64

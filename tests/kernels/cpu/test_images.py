@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import INNER, why_unavailable
 from pcdata.functional.depth.deproject import Deprojected
+from pcdata.functional.depth.looks import look_at_depth
 from pcdata.geometry import rigid
 from pcdata.rng import seeded
 
@@ -180,3 +181,24 @@ def test_gradients_reach_the_depth():
     depth = depth_image().requires_grad_()
     deproject_images(depth, K.repeat(3, 1, 1), None, None, {}).points.sum().backward()
     assert int((depth.grad != 0).sum()) == int((depth > 0).sum())
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 1), (2, 3, 7), (1, 300, 301)])
+def test_a_look_at_depth_is_the_references(shape):
+    depth = torch.rand(shape, generator=seeded(5)) + 0.1
+    last = depth.flatten()[-1:]
+    others = {"none": None, "itself": depth, "equal": depth.clone(), "near": depth + 1e-6, "far": torch.zeros(shape)}
+    others["last"] = torch.cat([depth.flatten()[:-1], last + 1]).reshape(shape)
+    for spoilt in (None, 0.0, -0.0, -1.0, torch.nan, torch.inf):
+        depth.flatten()[-1] = last if spoilt is None else spoilt
+        for name, other in others.items():
+            ours, theirs = (look_at_depth(depth, other, backend=backend) for backend in ("cpu", "torch"))
+            assert ours.is_same == theirs.is_same, name
+            np.testing.assert_array_equal([ours.least, ours.largest], [theirs.least, theirs.largest])
+        copy = torch.zeros_like(depth)
+        look_at_depth(depth, None, copy, backend="cpu")
+        assert torch.equal(copy.nan_to_num(7), depth.nan_to_num(7))
+    crossed = depth.nan_to_num(1, 1).mT
+    assert look_at_depth(crossed, crossed.contiguous(), backend="cpu").is_same
+    with pytest.raises(ValueError, match="beside"):
+        look_at_depth(depth, torch.zeros(3), backend="cpu")

@@ -62,6 +62,12 @@ PC_EXPORT int32_t pc_deproject(const pc_context* context, const float* depth, in
 PC_EXPORT int32_t pc_mask_depth(const pc_context* context, const float* depth, int64_t count, double near, double far,
                                 const uint8_t* mask, float* masked);
 
+// What is asked of every image of a stream: extremes (2,) the least and the largest of depth (count,), both NaN where
+// one is NaN or infinite; *same whether all are as before, which may be null: then they are not. Written to copy, which
+// may be null. Zeros of both signs are the same, NaN never is.
+PC_EXPORT int32_t pc_look_at_depth(const pc_context* context, const float* depth, int64_t count, const float* before,
+                                   float* copy, float* extremes, int64_t* same);
+
 // Depth images (views, height, width) -> registered and pixel_index (views, color_height, color_width), occluding of
 // that shape and hidden (views, height, width), as register_depth describes them. Rays are those of pc_choose_pixels.
 // Per view: color_from_depth (4, 4), color_intrinsics (3, 3), half_pixels (2,), and lenses (14,), which may be null.
@@ -260,9 +266,10 @@ PC_EXPORT int32_t pc_flying_pixels(const pc_context* context, const float* depth
                                    int64_t width, double tolerance, int64_t least, uint8_t* flying);
 
 // The same -> kept (num_views, height, width), without them; with confidence of that shape, else null, kept_confidence
-// that is 0 there.
+// that is 0 there. With is_masked the images are those that pc_mask_depth would make first.
 PC_EXPORT int32_t pc_without_flying_pixels(const pc_context* context, const float* depth, int64_t num_views,
-                                           int64_t height, int64_t width, double tolerance, int64_t least,
+                                           int64_t height, int64_t width, int64_t is_masked, double near, double far,
+                                           const uint8_t* mask, double tolerance, int64_t least,
                                            const uint8_t* confidence, float* kept, uint8_t* kept_confidence);
 
 // values (N,) of points on the pixels (N,), rising within each cloud, of images (height, width) -> medians (N,): the
@@ -406,6 +413,11 @@ PC_EXPORT int32_t pc_neighborhood_shapes(const pc_context* context, const float*
 PC_EXPORT int32_t pc_normals(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                              int64_t max_neighbors, double limit, const int64_t* pixel, int64_t width,
                              const double* camera, float* normals);
+
+// facing (N, 3) = normals (N, 3), turned where they face away from the viewpoint, (N, 3) or one (3,) for all:
+// normal . (viewpoint - point) < 0, in double.
+PC_EXPORT int32_t pc_face_normals(const pc_context* context, const float* points, const float* normals, int64_t count,
+                                  const float* viewpoint, int64_t one_for_all, float* facing);
 
 // mean (N,) double is working space; outlier (N,) bool. pixel null: no grid.
 PC_EXPORT int32_t pc_statistical_outliers(const pc_context* context, const float* points, const int64_t* ptr,

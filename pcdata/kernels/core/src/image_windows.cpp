@@ -135,14 +135,16 @@ PC_EXPORT int32_t pc_flying_pixels(const pc_context* context, const float* depth
 }
 
 PC_EXPORT int32_t pc_without_flying_pixels(const pc_context* context, const float* depth, int64_t num_views,
-                                           int64_t height, int64_t width, double tolerance, int64_t least,
+                                           int64_t height, int64_t width, int64_t is_masked, double near, double far,
+                                           const uint8_t* mask, double tolerance, int64_t least,
                                            const uint8_t* confidence, float* kept, uint8_t* kept_confidence) {
   using namespace pc;
   using namespace pc::windows;
   return guarded([&] {
     const FloatRegister part = FloatRegister{} + static_cast<float>(tolerance);
     const Int32Register wanted = Int32Register{} + static_cast<int32_t>(least);
-    images::for_rows(*context, depth, {num_views, height, width}, 1, [&](int64_t row, const float* const* rows) {
+    const images::DepthRange range{static_cast<float>(near), static_cast<float>(far), mask};
+    const auto without = [&](int64_t row, const float* const* rows) {
       float* to = kept + row * width;
       for (int64_t u = 0; u < width; u += kLanes) {
         const float* const some[3] = {rows[0] + u, rows[1] + u, rows[2] + u};
@@ -155,7 +157,8 @@ PC_EXPORT int32_t pc_without_flying_pixels(const pc_context* context, const floa
       const uint8_t* was = confidence + row * width;
       uint8_t* now = kept_confidence + row * width;
       for (int64_t u = 0; u < width; ++u) now[u] = own[u] > 0 && to[u] == 0 ? uint8_t{0} : was[u];
-    });
+    };
+    images::for_rows(*context, depth, {num_views, height, width}, 1, without, is_masked != 0 ? &range : nullptr);
   });
 }
 

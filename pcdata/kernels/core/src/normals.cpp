@@ -134,3 +134,19 @@ PC_EXPORT int32_t pc_normals(const pc_context* context, const float* points, con
         static_cast<float>(limit), normals);
   });
 }
+
+PC_EXPORT int32_t pc_face_normals(const pc_context* context, const float* points, const float* normals, int64_t count,
+                                  const float* viewpoint, int64_t one_for_all, float* facing) {
+  using namespace pc;
+  return guarded([&] {
+    parallel_for(*context, count, 1 << 15, [&](int64_t begin, int64_t end, int64_t) {
+      for (int64_t i = 3 * begin; i < 3 * end; i += 3) {
+        const float *p = points + i, *n = normals + i, *v = one_for_all != 0 ? viewpoint : viewpoint + i;
+        const double x = double{n[0]} * (double{v[0]} - double{p[0]}), y = double{n[1]} * (double{v[1]} - double{p[1]}),
+                     z = double{n[2]} * (double{v[2]} - double{p[2]});
+        const bool away = (x + y) + z < 0;
+        for (int axis = 0; axis < 3; ++axis) facing[i + axis] = away ? -n[axis] : n[axis];
+      }
+    });
+  });
+}
