@@ -20,7 +20,7 @@ import importlib
 import inspect
 import multiprocessing
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ParamSpec, TypeVar
 
@@ -117,7 +117,7 @@ def op(
             arguments = contract.bind(args, kwargs)
             contract.check(arguments)
             backend = arguments.pop("backend", "auto")
-            wants_gradient = gradient and _wants_gradient(arguments.values())
+            wants_gradient = gradient and torch.is_grad_enabled() and _wants_gradient(arguments.values())
             device = contract.device(arguments)
             backend = _choose(operation, backend, device, wants_gradient)
             body: Callable[..., R] | None = operation.kernels.get(backend)
@@ -156,8 +156,9 @@ def inner(reference: Callable[P, R]) -> Callable[P, R]:
     def function(*args: P.args, **kwargs: P.kwargs) -> R:
         backend = str(kwargs.pop("backend", "auto"))
         if backend == "auto":
-            tensors = list(_tensors_in((*args, *kwargs.values())))
             backend = REFERENCE
+            tensors: list[Tensor] = []
+            _add_tensors((*args, *kwargs.values()), tensors)
             if tensors and not _wants_gradient(tensors):
                 backend = first_live(tensors[0].device, operation.serves)
         body: Callable[P, R] = operation.kernels.get(backend, reference)
@@ -217,20 +218,28 @@ def backends() -> list[str]:
 
 
 def _wants_gradient(tensors: Iterable[Any]) -> bool:
-    wanted = False
     for value in tensors:  # not any(): a generator is resumed once per value
-        wanted |= isinstance(value, Tensor) and value.requires_grad
-    return wanted and torch.is_grad_enabled()
+        if isinstance(value, Tensor) and value.requires_grad:
+            return torch.is_grad_enabled()
+    return False
 
 
-def _tensors_in(arguments: Iterable[Any]) -> Iterator[Tensor]:
+_PLAIN = frozenset((int, float, bool, str, type(None)))
+
+
+def _add_tensors(arguments: Iterable[Any], found: list[Tensor]) -> None:
     for one in arguments:
-        if isinstance(one, Tensor):
-            yield one
+        kind = type(one)
+        if kind is Tensor:
+            found.append(one)
+        elif kind in _PLAIN:  # asking what it is an instance of, of mappings most of all, takes longer
+            continue
+        elif isinstance(one, Tensor):
+            found.append(one)
         elif isinstance(one, Mapping):
-            yield from _tensors_in(one.values())
+            _add_tensors(one.values(), found)
         elif isinstance(one, (list, tuple)):
-            yield from _tensors_in(one)
+            _add_tensors(one, found)
 
 
 def _tidy(arguments: dict[str, Any], *, detach: bool, contiguous: bool) -> None:

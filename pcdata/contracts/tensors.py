@@ -11,7 +11,7 @@ A contract is a short string read by :func:`check_tensors`:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -42,7 +42,7 @@ class _TensorSpec:
     """One parsed contract."""
 
     dims: tuple[str, ...]
-    sizes: tuple[int | None, ...]  # those of the dims that are numbers
+    bindings: tuple[tuple[str, int | None], ...]  # dims to be bound, with the size of those that are numbers
     dtypes: tuple[torch.dtype, ...]
     is_ptr: bool = False
     is_depth: bool = False  # no value is negative
@@ -62,11 +62,11 @@ def parse_spec(text: str) -> _TensorSpec:
     if text.startswith("ptr "):
         pointers, _, least = text.partition(">=")
         _, rows, clouds = pointers.split()
-        return _TensorSpec((rows, clouds), (None, None), (torch.int64,), is_ptr=True, least=int(least or 0))
+        return _TensorSpec((rows, clouds), ((clouds, None),), (torch.int64,), is_ptr=True, least=int(least or 0))
     shape, _, dtype = (part.strip() for part in text.partition(":"))
     dims = tuple(shape.split())
-    sizes = tuple([int(dim) if dim.isdigit() else None for dim in dims])
-    return _TensorSpec(dims, sizes, _DTYPES[dtype or "float32"], is_depth=dtype == "depth")
+    bindings = tuple([(dim, int(dim) if dim.isdigit() else None) for dim in dims])
+    return _TensorSpec(dims, bindings, _DTYPES[dtype or "float32"], is_depth=dtype == "depth")
 
 
 def check_tensors(
@@ -95,8 +95,9 @@ def check_tensors(
     """
     sizes: dict[str, int] = {}
     bound_by: dict[str, str] = {}
-    device: tuple[str, torch.device] | None = None
-    there: dict[str, Tensor] = {}  # whose values are to be read
+    first = ""
+    device: torch.device | None = None  # of the first
+    there: list[tuple[str, Tensor, _TensorSpec]] = []  # whose values are to be read
     for name, text in specs.items():
         value = values.get(name)
         if value is None:
@@ -108,20 +109,17 @@ def check_tensors(
             raise DTypeError(
                 f"{where}: {name} must be {spec.describe()}, not {value.dtype}; convert it before the call"
             )
-        _bind_shape(where, name, value, spec, sizes, bound_by)
+        _bind_shape(where, name, value.shape, spec, sizes, bound_by)
         if device is None:
-            device = (name, value.device)
-        elif value.device != device[1]:
-            raise DeviceError(
-                f"{where}: {name} is on {value.device} but {device[0]} is on {device[1]}; move one with .to()"
-            )
-        there[name] = value
+            first, device = name, value.device
+        elif value.device != device:
+            raise DeviceError(f"{where}: {name} is on {value.device} but {first} is on {device}; move one with .to()")
+        there.append((name, value, spec))
     if not check_values:
         return sizes
-    if device is not None and device[1].type != "cpu":
-        _read_values(there, specs, finite=finite)
-    for name, value in there.items():
-        spec = parse_spec(specs[name])
+    if device is not None and device.type != "cpu":
+        _read_values(there, finite=finite)
+    for name, value, spec in there:
         if spec.is_ptr:
             check_ptr_values(where, name, value, sizes.get(spec.dims[0]))
             if spec.least:
@@ -137,11 +135,10 @@ def check_tensors(
     return sizes
 
 
-def _read_values(values: Mapping[str, Tensor], specs: Mapping[str, str], *, finite: bool) -> None:
+def _read_values(values: Sequence[tuple[str, Tensor, _TensorSpec]], *, finite: bool) -> None:
     """Read what is not known of values on another device, all at once."""
     pointers, asked = [], []
-    for name, value in values.items():
-        spec = parse_spec(specs[name])
+    for _, value, spec in values:
         if held(value) is not None:
             continue
         if spec.is_ptr:
@@ -207,27 +204,29 @@ def _require_rows(where: str, ptr: Tensor, spec: _TensorSpec, rows: str) -> None
 
 
 def _bind_shape(
-    where: str, name: str, value: Tensor, spec: _TensorSpec, sizes: dict[str, int], bound_by: dict[str, str]
+    where: str, name: str, given: torch.Size, spec: _TensorSpec, sizes: dict[str, int], bound_by: dict[str, str]
 ) -> None:
-    given = tuple(value.shape)
-    dims, wanted, found = spec.dims, spec.sizes, given
+    wanted: Sequence[tuple[str, int | None]] = spec.bindings
+    found: Sequence[int] = given
     if spec.is_ptr:
         if len(given) != 1 or given[0] < 2:
-            raise ShapeError(f"{where}: {name} must be {spec.describe()}, got shape {given}; one cloud is [0, N]")
-        dims, wanted, found = dims[1:], wanted[1:], (given[0] - 1,)
-    elif len(given) != len(dims):
-        raise ShapeError(f"{where}: {name} must be {spec.describe()}, got shape {given}")
-    for want, size in zip(wanted, found):
-        if want is not None and want != size:
-            raise ShapeError(f"{where}: {name} must be {spec.describe()}, got shape {given}")
-    for dim, want, size in zip(dims, wanted, found):
-        if want is not None:
-            continue
-        if sizes.setdefault(dim, size) != size:
             raise ShapeError(
-                f"{where}: {name} has {dim}={size} but {bound_by[dim]} has {dim}={sizes[dim]}; they must agree"
+                f"{where}: {name} must be {spec.describe()}, got shape {tuple(given)}; one cloud is [0, N]"
             )
-        bound_by.setdefault(dim, name)
+        found = (given[0] - 1,)
+    fits = len(found) == len(wanted)
+    for (_, want), size in zip(wanted, found):
+        fits = fits and (want is None or want == size)
+    if not fits:
+        raise ShapeError(f"{where}: {name} must be {spec.describe()}, got shape {tuple(given)}")
+    for (dim, want), size in zip(wanted, found):
+        if want is None:
+            if dim not in sizes:
+                sizes[dim], bound_by[dim] = size, name
+            elif sizes[dim] != size:
+                raise ShapeError(
+                    f"{where}: {name} has {dim}={size} but {bound_by[dim]} has {dim}={sizes[dim]}; they must agree"
+                )
 
 
 def _short(values: list[int]) -> str:

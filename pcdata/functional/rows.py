@@ -9,7 +9,7 @@ taken in row order.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise
+from itertools import accumulate, pairwise
 
 import numpy as np
 import torch
@@ -32,7 +32,8 @@ def counts_from_ptr(ptr: Tensor) -> Tensor:
 def ptr_from_counts(counts: Tensor | Iterable[int], device: torch.device | None = None) -> Tensor:
     """Return (B+1,) row pointers for (B,) counts."""
     if not isinstance(counts, Tensor):
-        counts = torch.tensor(list(counts), dtype=torch.int64, device="cpu")
+        ends = torch.from_numpy(np.array([0, *accumulate(counts)], np.int64))
+        return ends if device is None else uploaded(ends, device)
     counts = counts.to(dtype=torch.int64)
     ptr = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
     return ptr if device is None or ptr.device.type != "cpu" else uploaded(ptr, device)

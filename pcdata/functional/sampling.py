@@ -221,13 +221,14 @@ def _rows_from_start(where: str, ptr: Tensor, start: Tensor | None, seeds: Tenso
     """Return the rows of every cloud, the one to start at first; None where they stay in order."""
     if start is not None and seeds is not None:
         raise ConfigError(f"{where}: give either start, a row of each cloud, or seeds to draw it from")
+    if start is None and seeds is None:
+        return None
     sizes = counts_from_ptr(ptr)
     if seeds is not None:
         start = torch.where(
             sizes > 0, (words(seeds, torch.zeros_like(seeds)) >> 1 & (2**62 - 1)) % sizes.clamp(min=1), 0
         )
-    if start is None:
-        return None
+    assert start is not None
     for number, (first, size) in enumerate(zip(on_host(start).tolist() if seeds is None else (), counts_of(ptr))):
         if not 0 <= first < max(1, size):
             raise OutOfRangeError(

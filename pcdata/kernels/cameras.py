@@ -49,8 +49,9 @@ class _Key:
     """A small tensor that a cache can look up by value."""
 
     def __init__(self, tensor: Tensor) -> None:
-        self.tensor = (tensor if tensor.device.type == "cpu" else on_host(tensor)).detach().clone()
-        self.value = tensor.dtype, tuple(tensor.shape), tuple(self.tensor.flatten().tolist())
+        here = on_host(tensor)
+        self.tensor = here.clone() if tensor.is_cpu else here
+        self.value = tensor.dtype, tensor.shape, self.tensor.numpy().tobytes()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Key) and self.value == other.value

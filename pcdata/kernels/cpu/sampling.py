@@ -12,8 +12,9 @@ from torch import Tensor
 import pcdata.functional.planes
 import pcdata.functional.sampling  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
+from pcdata.contracts.on_host import counts_of
 from pcdata.functional.planes import MAX_REFINEMENTS
-from pcdata.functional.rows import counts_from_ptr, first_per_cloud, ptr_from_counts
+from pcdata.functional.rows import first_per_cloud, ptr_from_counts
 from pcdata.functional.voxels import SIZE_TOLERANCE
 from pcdata.geometry.plane_fit import FLAT, plane_of_moments
 from pcdata.kernels.cpu.native import call, numbers, room
@@ -178,7 +179,7 @@ def fit_planes(points: Tensor, ptr: Tensor, chosen: Tensor) -> Tensor:
 
 
 def _too_long(ptr: Tensor) -> bool:
-    return int(counts_from_ptr(ptr).max()) > _MAX_ROWS
+    return max(counts_of(ptr)) > _MAX_ROWS
 
 
 def _reference(name: str, *args: Any, **kwargs: Any) -> Any:
