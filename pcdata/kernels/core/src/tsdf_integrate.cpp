@@ -16,23 +16,50 @@ inline void vote(int32_t* label, int16_t* votes, const Int32Register& seen, Regi
   store_narrowed(votes, select(near, after, lead));
 }
 
+// Call body(first voxel) for each of some groups.
 template <class Body>
-void for_each_group(const ProjectedBlock& block, Body&& body) {
-  for (int word = 0; word < (kGroups + 31) / 32; ++word)
-    for (uint32_t left = block.groups[word]; left != 0; left &= left - 1)
+void for_each(const GroupSet& groups, Body&& body) {
+  for (int word = 0; word < GroupSet::kWords; ++word)
+    for (uint32_t left = groups.words[word]; left != 0; left &= left - 1)
       body((32 * word + __builtin_ctz(left)) * kLanes);
 }
 
-// Send for the voxels that a view may update.
-void fetch(const VoxelPlanes& planes, const ProjectedBlock& block) {
-  const int16_t *const tsdfs = planes.tsdf.block(block.row), *const weights = planes.weight.block(block.row);
-  const int32_t* const colors = planes.color ? planes.color.block(block.row) : nullptr;
-  for_each_group(block, [&](int at) {
-    __builtin_prefetch(tsdfs + at, 1);
-    __builtin_prefetch(weights + at, 1);
-    if (colors != nullptr) __builtin_prefetch(colors + at, 1);
-  });
-}
+// Sends for the voxels that a view may update, some lines at a time and not into the first cache: all at once they
+// would fill the ways to memory and hold up what is being updated meanwhile.
+class Fetch {
+ public:
+  Fetch(const VoxelPlanes& planes, const ProjectedBlock& block)
+      : tsdf_(planes.tsdf.block(block.row)),
+        weight_(planes.weight.block(block.row)),
+        color_(planes.color ? planes.color.block(block.row) : nullptr) {
+    for (int line = 0; line < kLines; ++line) {
+      const uint32_t groups = block.groups.words[line * kPerLine / 32] >> line * kPerLine % 32;
+      lines_ |= uint32_t{(groups & ((1u << kPerLine) - 1)) != 0} << line;
+    }
+  }
+
+  void one() {
+    if (lines_ == 0) return;
+    const int at = __builtin_ctz(lines_) * kInLine;
+    lines_ &= lines_ - 1;
+    __builtin_prefetch(tsdf_ + at, 0, kIntoSecond);
+    __builtin_prefetch(weight_ + at, 0, kIntoSecond);
+    if (color_ == nullptr) return;
+    __builtin_prefetch(color_ + at, 0, kIntoSecond);
+    __builtin_prefetch(color_ + at + kInLine / 2, 0, kIntoSecond);
+  }
+  void rest() {
+    while (lines_ != 0) one();
+  }
+
+ private:
+  static constexpr int kIntoSecond = 1;                                                        // cache
+  static constexpr int kInLine = 32, kLines = kVoxels / kInLine, kPerLine = kInLine / kLanes;  // voxels, lines, groups
+
+  const int16_t *tsdf_, *weight_;
+  const int32_t* color_;
+  uint32_t lines_ = 0;  // still to be sent for
+};
 
 // What a view says about some voxels.
 struct Sight {
@@ -88,7 +115,7 @@ class Sights {
 
 // Average what a view says into the voxels of a block. kMore: with weights, labels or views.
 template <class Pixels, bool kInside, bool kBent, bool kMore>
-void update(const FusedView& view, const VoxelPlanes& planes, const ProjectedBlock& block) {
+void update(const FusedView& view, const VoxelPlanes& planes, const ProjectedBlock& block, Fetch& next) {
   const FloatRegister zero = {}, most = zero + kTsdfScale;
   const bool has_color = planes.color && view.color != nullptr, carve = view.carve;
   int16_t *const tsdfs = planes.tsdf.block(block.row), *const weights = planes.weight.block(block.row);
@@ -102,18 +129,20 @@ void update(const FusedView& view, const VoxelPlanes& planes, const ProjectedBlo
   const Table pixel_weights(view, block, has_weights ? view.weight : none);
   const Table pixel_labels(view, block, has_labels ? view.label : none);
   constexpr auto lasting = static_cast<int16_t>(kMaxWeight);
-  Uint16Lanes lane;
-  for (int i = 0; i < kLanes; ++i) lane[i] = static_cast<uint16_t>(i);
-  for_each_group(block, [&](int at) {
+  for_each(block.groups, [&](int at) {
+    next.one();
     const Sight sight = sights.of(at);
     const RegisterMask not_behind = less_equal(-most, sight.scaled);
     const RegisterMask near = less_equal(sight.scaled, most) & not_behind;
-    if (!any(carve ? not_behind : near)) return;
-    const auto old_weight = load<Int16Lanes>(weights + at), stored = load<Int16Lanes>(tsdfs + at);
+    const bool is_near = any(near);
+    if (!is_near && !(carve && any(not_behind))) return;
+    const auto old_weight = load<Int16Lanes>(weights + at);
     const Int16Lanes count = kMore ? load<Int16Lanes>(counts + at) : old_weight;
     const Int32Register wide_weight = widened(old_weight);
     RegisterMask seen = near;
     if (carve) seen = near | (not_behind & less(Int32Register{}, wide_weight));
+    if (!is_near && !any(seen)) return;  // in front of the surface, where nothing was seen before
+    const auto stored = load<Int16Lanes>(tsdfs + at);
     const FloatRegister more = has_weights ? as_float(pixel_weights.at(sight.place)) : zero + 1;
     const FloatRegister sum = as_float(wide_weight) + more;
     const FloatRegister share = more / sum;
@@ -124,14 +153,11 @@ void update(const FusedView& view, const VoxelPlanes& planes, const ProjectedBlo
                                           : old_weight - (old_weight < lasting);  // a comparison is -1 where it holds
     store(weights + at, select(seen, weight, old_weight));
     if (kMore && counts != weights) store(counts + at, select(seen, count - (count < lasting), count));
-    if (!any(near)) return;  // seen past, as a fifth of all are
+    if (!is_near) return;  // seen past
     if (has_color) {
-      const auto voxel = lane + static_cast<uint16_t>(at);
-      const auto turn = math::color_turn<Uint16Lanes>(reinterpret_cast<const Uint16Lanes&>(count), voxel);
       const auto color = load<Int32Register>(colors + at);
       const Int32Register mixed =
-          math::mixed_color<Int32Register>(color, pixel_colors.at(sight.place), rounded(share * 32768),
-                                           widened(reinterpret_cast<const Int16Lanes&>(turn)));
+          mixed_color(color, pixel_colors.at(sight.place), rounded(share * -32768), color_turn(widened(count), at));
       store(colors + at, select(near, mixed, color));
     }
     if constexpr (kMore) {
@@ -154,29 +180,37 @@ void with_pixels([[maybe_unused]] const ProjectedBlock& block, Body&& body) {
 }
 
 template <bool kMore>
-void update(const FusedView& view, const VoxelPlanes& planes, const ProjectedBlock& block) {
+void update(const FusedView& view, const VoxelPlanes& planes, const ProjectedBlock& block, Fetch& next) {
   if (view.lens != nullptr)
-    update<ImagePixels, false, true, kMore>(view, planes, block);
+    update<ImagePixels, false, true, kMore>(view, planes, block, next);
   else if (!block.inside)
-    update<ImagePixels, false, false, kMore>(view, planes, block);
+    update<ImagePixels, false, false, kMore>(view, planes, block, next);
   else
-    with_pixels(block, [&](auto pixels) { update<decltype(pixels), true, false, kMore>(view, planes, block); });
+    with_pixels(block, [&](auto pixels) { update<decltype(pixels), true, false, kMore>(view, planes, block, next); });
 }
 
 template <bool kMore>
 void integrate(const pc_context& context, const FusedView& view, const VoxelPlanes& planes, const int64_t* rows,
                int64_t num_rows, const int64_t* keys) {
   constexpr int64_t kBlocks = 64;
-  constexpr int64_t kAhead = 2;  // blocks on their way from memory
   const BlockProjector projector(view);
   parallel_for(context, num_rows, kBlocks, [&](int64_t begin, int64_t end, int64_t) {
-    ProjectedBlock waiting[kAhead];
-    for (int64_t i = begin; i < end + kAhead; ++i) {
-      ProjectedBlock& turn = waiting[i % kAhead];
-      if (i >= begin + kAhead) update<kMore>(view, planes, turn);
-      if (i >= end) continue;
-      turn = projector.of(keys[rows[i]], rows[i]);
-      fetch(planes, turn);
+    if (begin == end) return;
+    const auto aimed = [&](int64_t i) {
+      const int64_t row = rows[std::min(i, end - 1)];
+      return projector.aim(keys[row], row);
+    };
+    ProjectedBlock here = aimed(begin), next = aimed(begin + 1);
+    projector.judge(here);
+    Fetch(planes, here).rest();
+    for (int64_t i = begin; i < end; ++i) {
+      const ProjectedBlock after = aimed(i + 2);
+      projector.judge(next);
+      Fetch fetch(planes, next);
+      update<kMore>(view, planes, here, fetch);
+      fetch.rest();
+      here = next;
+      next = after;
     }
   });
 }
