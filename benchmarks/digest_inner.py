@@ -102,6 +102,9 @@ def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     rows = torch.tensor([3, 3, 89, 0])
     yield "pick_rows", "index", lambda: ((_fields(), rows), {})
     yield "pick_rows", "mask", lambda: ((_fields(), points(90, 1)[:, 0] > 0.1), {})
+    marks, ptr = points(90, 1)[:, 0] > 0.1, ptr_of(50, 40)
+    yield "kept_rows", "gone", lambda: ((marks, ptr), {"gone": True})
+    yield "kept_rows", "within", lambda: ((marks, ptr), {"within": points(90, 1)[:, 1] > 0.05})
     yield "join_rows", "two", lambda: ((_parts(),), {})
     yield "pad_rows", "two", lambda: ((_parts(), 60, _fillers()), {})
     for name in ("transform_points", "transform_directions"):

@@ -65,6 +65,15 @@ def words(keys: Tensor, number: Tensor) -> Tensor:
     return mixed ^ _shifted(mixed, 31)
 
 
+def mixed_words(keys: NDArray[np.uint64], number: NDArray[np.int64]) -> NDArray[np.uint64]:
+    """Return the same of NumPy arrays, on the calling thread alone."""
+    mixed = keys + (number.astype(np.uint64) + np.uint64(1)) * np.uint64(_GOLDEN)
+    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(_FIRST)
+    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(_SECOND)
+    found: NDArray[np.uint64] = mixed ^ (mixed >> np.uint64(31))
+    return found
+
+
 def _signed(word: int) -> int:
     return word - (1 << 64) if word >> 63 else word
 

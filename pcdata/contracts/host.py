@@ -1,13 +1,10 @@
-"""Fast answers about tensors in host memory: finite, negative, rising, how many, the same as before.
+"""Fast answers about tensors in host memory: finite, negative, rising, how many.
 
 On the CPU these work through NumPy, on one thread: the OpenMP threads that torch would wake spin for ten milliseconds
 after every operation, and would take the cores from the kernel that is about to start.
 """
 
 from __future__ import annotations
-
-import itertools
-import zlib
 
 import numpy as np
 import torch
@@ -61,22 +58,6 @@ def differing(a: Tensor, b: Tensor) -> Tensor:
 def equal_values(a: Tensor, b: Tensor) -> bool:
     """Say whether two tensors of one shape hold the same values."""
     return bool(np.array_equal(a.numpy(), b.numpy())) if a.device.type == "cpu" else torch.equal(a, b)
-
-
-def checksums(values: Tensor, bounds: list[int], first: list[int] | None = None) -> list[int]:
-    """Return a checksum of the rows of every segment ``bounds[b]:bounds[b + 1]``.
-
-    Args:
-        values: (N, ...), on any device.
-        bounds: row pointers.
-        first: values are row numbers: they count from these, and what is below 0 stays.
-    """
-    array = values.detach().cpu().contiguous().numpy()
-    sums = []
-    for b, (start, stop) in enumerate(itertools.pairwise(bounds)):
-        own = array[start:stop]
-        sums.append(zlib.crc32((own if first is None else np.where(own < 0, own, own - first[b])).tobytes()))
-    return sums
 
 
 def rising(values: Tensor, ptr: Tensor) -> bool:

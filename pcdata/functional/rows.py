@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import accumulate, pairwise
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from pcdata.contracts.checksums import checksums
 from pcdata.contracts.dispatch import inner
 from pcdata.contracts.host import all_finite
 from pcdata.contracts.on_host import bounds_of, uploaded
@@ -81,11 +83,42 @@ def picked_rows(mask: Tensor, ptr: Tensor) -> tuple[Tensor, Tensor]:
     return rows_of_mask(mask, bounds_of(after)[-1]), after
 
 
+class KeptRows(NamedTuple):
+    """What a decision leaves of the rows of packed clouds."""
+
+    keep: Tensor  # (N,) bool
+    ptr: Tensor  # (B+1,) int64: row pointers of the rows that stay
+    sums: Tensor | None  # (B,) int64 that tell which stay: their checksums; None where the host would wait for them
+
+
 @inner
-def pick_rows(fields: Mapping[str, Tensor], rows: Tensor, *, in_place: bool = False) -> dict[str, Tensor]:
+def kept_rows(marks: Tensor, ptr: Tensor, *, gone: bool = False, within: Tensor | None = None) -> KeptRows:
+    """Keep the rows whose mark, of a (N,) bool mask, is true; or with ``gone`` those whose mark is not.
+
+    Of all but the rows ``within``, a (N,) bool mask too, nothing is kept or told: checksums are those of marks that
+    only these rows have.
+    """
+    keep = ~marks if gone else marks
+    told, told_ptr = keep, ptr
+    if within is not None:
+        keep, told, told_ptr = keep & within, keep[within], ptr_after_mask(within, ptr)
+    sums = None
+    if keep.device.type == "cpu":
+        sums = torch.tensor(checksums(told, bounds_of(told_ptr)), dtype=torch.int64, device="cpu")
+    return KeptRows(keep, ptr_after_mask(keep, ptr), sums)
+
+
+@inner
+def pick_rows(
+    fields: Mapping[str, Tensor], rows: Tensor, *, in_place: bool = False, count: int | None = None
+) -> dict[str, Tensor]:
     """Return ``field[rows]`` of every (N, ...) field, for (M,) int64 rows or a (N,) bool mask.
 
-    ``in_place`` the rows of a mask are moved to the beginning of their field's own memory, which is the result.
+    Args:
+        fields: by name.
+        rows: which.
+        in_place: the rows of a mask are moved to the beginning of their field's own memory, which is the result.
+        count: how many rows of a mask are true, where the caller knows: then they are copied in one go.
     """
     index = torch.nonzero(rows).squeeze(1) if rows.dtype is torch.bool else rows
     if in_place:

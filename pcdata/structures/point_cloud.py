@@ -228,16 +228,19 @@ class PointCloud(CloudBatch):
         Raises:
             ShapeError: ptr (B+1,) int64 does not cut the M rows into B clouds.
         """
-        is_mask = index.dtype is torch.bool
-        if is_mask and self.device.type != "cpu" and index.shape == (self.num_points,):
-            (count,), bounds = read_together([index.sum(), ptr])
-            hold(ptr, torch.tensor(bounds, dtype=ptr.dtype, device="cpu"))
-            index = rows_of_mask(index, count)
-        rows = pick_rows(self.fields(), index)
-        sizes = check_tensors("PointCloud", {**rows, "ptr": ptr}, _SELECTED, check_values=False)
+        given = {"points": self.points, "ptr": ptr}
+        sizes = check_tensors("PointCloud", given, _SELECTED, check_values=False)
         if sizes["B"] != self.num_clouds:
             raise ShapeError(f"PointCloud.select: ptr cuts {sizes['B']} clouds out of {self.num_clouds}")
-        check_ptr_values("PointCloud", "ptr", ptr, sizes["N"])
+        is_mask, count = index.dtype is torch.bool, None
+        if is_mask and self.device.type == "cpu":
+            count = int(ptr[-1])  # if it is wrong, it is checked below
+        elif is_mask and index.shape == (self.num_points,):
+            (found,), bounds = read_together([index.sum(), ptr])
+            hold(ptr, torch.tensor(bounds, dtype=ptr.dtype, device="cpu"))
+            index = rows_of_mask(index, found)
+        rows = pick_rows(self.fields(), index, count=count)
+        check_ptr_values("PointCloud", "ptr", ptr, len(rows["points"]))
         layout = self.layout if is_mask else None
         if is_known(FINITE, self.points):
             note(FINITE, rows["points"])

@@ -38,6 +38,7 @@ from pcdata.transforms.class_checks import check_class, undeclared_streams, watc
 from pcdata.transforms.decisions import (
     LISTS,
     PER_ROW,
+    TOLD_ROWS,
     Decision,
     Decisions,
     Entry,
@@ -103,7 +104,7 @@ class Transform(nn.Module):
         """Decide: all that is random or derived from the data; only steps that say ``is_random`` draw from ``streams``.
 
         Every value has leading dimension B, except ``index``, ``ptr``, ``per_point`` and those named after a per-point
-        field.
+        field. ``rows`` (B,) int64 tells which rows were decided about, where the step knows; else it is found out.
         """
         return {}
 
@@ -530,7 +531,7 @@ def _small(params: Params, num: int) -> dict[str, _Values]:
     kept: dict[str, _Values] = {}
     for name, value in params.items():
         # By name, not by shape alone: with one point per cloud the shapes are the same.
-        is_per_cloud = name not in PER_ROW and name not in LISTS
+        is_per_cloud = name not in PER_ROW and name not in LISTS and name != TOLD_ROWS
         if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value.numel() <= 16 * num:
             kept[name] = value.detach().numpy() if value.device.type == "cpu" else value.detach()
     return kept

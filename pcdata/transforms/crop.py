@@ -18,7 +18,7 @@ from pcdata.structures import PointCloud
 from pcdata.structures.signal_kinds import poses_of_signal
 from pcdata.transforms.base import Params
 from pcdata.transforms.decisions import Decisions
-from pcdata.transforms.families import GEOMETRY, RemoveTransform
+from pcdata.transforms.families import GEOMETRY, RemoveTransform, kept_params
 from pcdata.transforms.field_types import Matrix4, Name, Vec3
 
 
@@ -122,8 +122,7 @@ class CropWorkspace(RemoveTransform):
             raise NonFiniteError(
                 "CropWorkspace: the cloud has NaN or infinite coordinates; put DropNonFinite before it"
             )
-        keep = ~inside if self.invert else inside
-        return {"index": keep, "ptr": ptr_after_mask(keep, cloud.ptr), **boxes}
+        return {**kept_params(inside, cloud.ptr, gone=self.invert), **boxes}
 
 
 def _signal(cloud: PointCloud, name: str) -> Tensor | tuple[str, ...]:

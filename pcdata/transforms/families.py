@@ -13,10 +13,11 @@ from torch import Tensor
 
 from pcdata.errors import PcdataWarning, ReplayError, TooFewPointsError
 from pcdata.functional.fixed_rows import FixedRows, move_kept
+from pcdata.functional.rows import kept_rows
 from pcdata.rng import Streams
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms.base import Params, Transform, sample_name
-from pcdata.transforms.decisions import Decisions
+from pcdata.transforms.decisions import TOLD_ROWS, Decisions
 from pcdata.transforms.field_types import Fraction
 
 GEOMETRY = ("points", "source_index", "viewpoint")  # where points lie, on which pixels, and what saw them
@@ -106,6 +107,13 @@ class DropLimit(Transform, abstract=True):
             if self.drop_alarm == "error":
                 raise TooFewPointsError(text)
             warnings.warn(text, LeftOutWarning, stacklevel=2)
+
+
+def kept_params(marks: Tensor, ptr: Tensor, *, gone: bool = False) -> Params:
+    """Return the params of a selection that keeps the rows that are marked, or with ``gone`` those that are not."""
+    keep, kept_ptr, sums = kept_rows(marks, ptr, gone=gone)
+    params = {"index": keep, "ptr": kept_ptr}
+    return params if sums is None else {**params, TOLD_ROWS: sums}
 
 
 class RemoveTransform(DropLimit, SelectTransform, abstract=True):

@@ -8,14 +8,13 @@ from typing import Annotated, Any
 from torch import Tensor
 
 from pcdata.contracts.dispatch import roomy_body
-from pcdata.contracts.host import negated
 from pcdata.functional.fixed_rows import FixedRows
 from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
-from pcdata.functional.rows import ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.sensors import SensorProfile
 from pcdata.structures import PointCloud
-from pcdata.transforms.families import GEOMETRY, RemoveTransform
+from pcdata.transforms.base import Params
+from pcdata.transforms.families import GEOMETRY, RemoveTransform, kept_params
 from pcdata.transforms.field_types import Count, FromSensor, Metres, Positive
 
 
@@ -36,13 +35,12 @@ class RemoveStatisticalOutliers(RemoveTransform):
         """The points and the image."""
         return GEOMETRY
 
-    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
-        """Pick the usual rows."""
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
+        """Keep the usual rows."""
         outlier = statistical_outlier_mask(
-            cloud.points, cloud.ptr, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio, grid=cloud.image_grid()
+            data.points, data.ptr, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio, grid=data.image_grid()
         )
-        keep = negated(outlier)
-        return keep, ptr_after_mask(keep, cloud.ptr)
+        return kept_params(outlier, data.ptr, gone=True)
 
     def fixed_keep(self, like: FixedRows) -> Callable[[FixedRows], Tensor] | None:
         """Mark the usual rows."""
@@ -63,13 +61,12 @@ class RemoveRadiusOutliers(RemoveTransform):
         """The points and the image."""
         return GEOMETRY
 
-    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
-        """Pick the rows with company."""
+    def make_params(self, data: PointCloud, streams: Streams) -> Params:
+        """Keep the rows with company."""
         outlier = radius_outlier_mask(
-            cloud.points, cloud.ptr, min_neighbors=self.min_neighbors, radius=self.radius, grid=cloud.image_grid()
+            data.points, data.ptr, min_neighbors=self.min_neighbors, radius=self.radius, grid=data.image_grid()
         )
-        keep = negated(outlier)
-        return keep, ptr_after_mask(keep, cloud.ptr)
+        return kept_params(outlier, data.ptr, gone=True)
 
     def fixed_keep(self, like: FixedRows) -> Callable[[FixedRows], Tensor] | None:
         """Mark the rows with company."""

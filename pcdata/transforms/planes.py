@@ -23,7 +23,7 @@ from pcdata.functional.largest_planes import words_drawn
 from pcdata.functional.plane_patch import plane_patch
 from pcdata.functional.plane_segments import supporting_plane
 from pcdata.functional.planes import near_planes, ransac_plane
-from pcdata.functional.rows import cloud_of_rows, count_per_cloud, ptr_after_mask
+from pcdata.functional.rows import cloud_of_rows, count_per_cloud, kept_rows, ptr_after_mask
 from pcdata.functional.selection import over_hull
 from pcdata.functional.table_surface import table_surface
 from pcdata.geometry import rigid
@@ -165,7 +165,7 @@ class RemovePlane(RemoveTransform):
         height: Tensor | None = None,
     ) -> Params:
         """Say which rows stay beside the points of each cloud's plane, by their height above it."""
-        keep = negated(own if gone is None else gone)
+        keep, kept_ptr, _ = kept_rows(own if gone is None else gone, data.ptr, gone=True)
         if self.keep != "both":
             for b, plane in enumerate(planes.cpu()):
                 self._require_upper_side(data, b, plane)
@@ -186,11 +186,12 @@ class RemovePlane(RemoveTransform):
                     for part, plane in zip(parts, planes)
                 ]
             )
+        is_slab = gone is None and self.keep == "both"
         return {
             "index": keep,
-            "ptr": ptr_after_mask(keep, data.ptr),
+            "ptr": kept_ptr if self.keep == "both" else ptr_after_mask(keep, data.ptr),
             "planes": planes,
-            "num_inliers": count_per_cloud(own, data.ptr),
+            "num_inliers": data.counts - kept_ptr.diff() if is_slab else count_per_cloud(own, data.ptr),
             "per_point": patch,
         }
 

@@ -14,17 +14,27 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import pcdata.functional.rows
 import pcdata.geometry.rigid  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, kernel
+from pcdata.functional.rows import KeptRows
 from pcdata.kernels.cpu.native import addresses, call, numbers, room, room_for
 
-_ROWS_PER_PIECE = 16384  # as in rows.cpp
 _MANY_ROWS = 300_000  # of all fields: some megabytes, which are worth a look at every part
 
 
+@kernel("kept_rows", "cpu")
+def kept_rows(marks: Tensor, ptr: Tensor, *, gone: bool = False, within: Tensor | None = None) -> KeptRows:
+    """Turn marks, count them and sum them up in one look."""
+    keep, kept_ptr, sums = room(marks.shape, torch.bool), room(ptr.shape, torch.int64), room(len(ptr) - 1, torch.int64)
+    others = None if within is None else within.contiguous()
+    call("pc_kept_rows", marks.contiguous(), gone, others, ptr.contiguous(), len(ptr) - 1, keep, kept_ptr, sums)
+    return KeptRows(keep, kept_ptr, sums)
+
+
 @kernel("pick_rows", "cpu")
-def pick_rows(fields: Mapping[str, Tensor], rows: Tensor, *, in_place: bool = False) -> dict[str, Tensor]:
+def pick_rows(
+    fields: Mapping[str, Tensor], rows: Tensor, *, in_place: bool = False, count: int | None = None
+) -> dict[str, Tensor]:
     """Copy the rows of all fields piece by piece."""
     sources = list(fields.values())
     num_rows = len(sources[0]) if sources and sources[0].ndim else 0
@@ -32,9 +42,9 @@ def pick_rows(fields: Mapping[str, Tensor], rows: Tensor, *, in_place: bool = Fa
         return _reference("pick_rows", fields, rows, in_place=in_place)
     if rows.dtype is torch.bool and len(rows) == num_rows:
         if not in_place:
-            return dict(zip(fields, _keep_rows(sources, rows.contiguous())))
+            return dict(zip(fields, _keep_rows(sources, rows.contiguous(), count)))
         if all(source.is_contiguous() for source in sources):
-            return dict(zip(fields, _keep_rows(sources, rows.contiguous(), in_place=True)))
+            return dict(zip(fields, _keep_rows_in_place(sources, rows.contiguous())))
     elif rows.dtype is torch.int64 and not in_place:
         picked = _take_rows(sources, rows.contiguous())
         if picked is not None:
@@ -42,15 +52,22 @@ def pick_rows(fields: Mapping[str, Tensor], rows: Tensor, *, in_place: bool = Fa
     return _reference("pick_rows", fields, rows, in_place=in_place)
 
 
-def _keep_rows(fields: Sequence[Tensor], mask: Tensor, *, in_place: bool = False) -> list[Tensor]:
-    starts = room(-(-len(mask) // _ROWS_PER_PIECE) + 1, torch.int64)
-    call("pc_count_kept", mask, len(mask), starts)
-    count = int(starts[-1])
-    sources, picked, sizes = _sources_and_picked(fields, 0 if in_place else count)
-    if in_place:
-        picked = [field[:count] for field in fields]
-    call("pc_keep_rows", mask, len(mask), starts, len(fields), addresses(sources), sizes, addresses(picked))
-    return picked
+def _keep_rows(fields: Sequence[Tensor], mask: Tensor, count: int | None) -> list[Tensor]:
+    """Return the rows of a mask; a count that turns out to be wrong does no harm."""
+    kept = room(1, torch.int64)
+    if count is None:
+        call("pc_keep_rows", mask, len(mask), -1, 0, numbers(()), numbers(()), numbers(()), kept)
+        count = int(kept)
+    sources, picked, sizes = _sources_and_picked(fields, count)
+    call("pc_keep_rows", mask, len(mask), count, len(fields), addresses(sources), sizes, addresses(picked), kept)
+    return picked if int(kept) == count else _keep_rows(fields, mask, int(kept))
+
+
+def _keep_rows_in_place(fields: Sequence[Tensor], mask: Tensor) -> list[Tensor]:
+    kept, where, sizes = room(1, torch.int64), addresses(fields), numbers(map(_row_bytes, fields))
+    call("pc_keep_rows", mask, len(mask), len(mask), len(fields), where, sizes, where, kept)
+    count = int(kept)
+    return [field[:count] for field in fields]
 
 
 def _take_rows(fields: Sequence[Tensor], index: Tensor) -> list[Tensor] | None:
@@ -66,7 +83,11 @@ def _sources_and_picked(fields: Sequence[Tensor], count: int) -> tuple[list[Tens
     """Return the fields without gaps, room for ``count`` rows of each, and the bytes of a row of each."""
     sources = [field.contiguous() for field in fields]
     picked = room_for(*[((count, *field.shape[1:]), field.dtype) for field in fields])
-    return sources, picked, numbers([field.nbytes // field.shape[0] for field in sources])
+    return sources, picked, numbers(map(_row_bytes, sources))
+
+
+def _row_bytes(field: Tensor) -> int:
+    return field.nbytes // field.shape[0]
 
 
 def _are_plain(fields: Sequence[Tensor], num_rows: int) -> bool:

@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0xCFF13242676710D
+INTERFACE_NUMBER = 0xC335062F522BD04
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -20,8 +20,10 @@ pc_register_depth: float* depth, int64 views, int64 height, int64 width, float* 
     rays, double* color_from_depth, double* color_intrinsics, double* half_pixels, double* lenses, int64 color_height,
     int64 color_width, double max_jump, float* registered, int64* pixel_index, uint8* occluding, uint8* hidden, int64*
     possible
-pc_count_kept: uint8* mask, int64 rows, int64* starts
-pc_keep_rows: uint8* mask, int64 rows, int64* starts, int64 num_fields, int64* sources, int64* row_bytes, int64* picked
+pc_kept_rows: uint8* marks, int64 gone, uint8* within, int64* ptr, int64 num_clouds, uint8* keep, int64* kept_ptr,
+    int64* sums
+pc_keep_rows: uint8* mask, int64 rows, int64 room, int64 num_fields, int64* sources, int64* row_bytes, int64* picked,
+    int64* kept
 pc_gather_kept: int64* ptr, int64 num_clouds, uint8* kept, int64* kept_ptr, int64 num_fields, int64* sources, int64*
     row_bytes, int64* picked
 pc_take_rows: int64* index, int64 num_picked, int64 rows, int64 num_fields, int64* sources, int64* row_bytes, int64*

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from pcdata.contracts.dispatch import INNER, why_unavailable
-from pcdata.functional.rows import pick_rows, ptr_after_mask, ptr_from_counts, transform_points
+from pcdata.functional.rows import kept_rows, pick_rows, ptr_after_mask, ptr_from_counts, transform_points
 from pcdata.geometry import rigid
 from pcdata.rng import seeded
 
@@ -56,6 +56,54 @@ def both(name: str, *args: Any) -> tuple[Any, Any]:
 def test_rows_of_a_mask_equal_the_reference(count, probability):
     mask = torch.rand(count, generator=seeded(1)) < probability
     assert_same(*both("pick_rows", fields(count), mask))
+
+
+@pytest.mark.parametrize("told", [0, 3, 700, 20_000, None])
+def test_rows_are_those_of_the_mask_whatever_count_is_told(told):
+    mask = torch.rand(20_000, generator=seeded(1)) < 0.3
+    found = INNER["pick_rows"].kernels["cpu"](fields(20_000), mask, count=told)
+    assert_same(found, INNER["pick_rows"].reference(fields(20_000), mask))
+
+
+CLOUDS = [[0], [1], [63], [64], [65], [0, 5, 0], [20_000, 1, 0, 40_000, 64], [7] * 300]
+
+
+@pytest.mark.parametrize("gone", [False, True])
+@pytest.mark.parametrize("among", [None, 0.0, 0.9, 1.0])
+@pytest.mark.parametrize("probability", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("counts", CLOUDS, ids=str)
+def test_kept_rows_equal_the_reference(counts, probability, among, gone):
+    marks = torch.rand(sum(counts), generator=seeded(3)) < probability
+    within = None if among is None else torch.rand(sum(counts), generator=seeded(4)) < among
+    options = {"gone": gone, "within": within}
+    found = INNER["kept_rows"].kernels["cpu"](marks, ptr_from_counts(counts), **options)
+    expected = INNER["kept_rows"].reference(marks, ptr_from_counts(counts), **options)
+    assert all(map(torch.equal, found, expected))
+
+
+def test_marks_that_are_other_bytes_than_0_and_1_are_true():
+    marks = torch.tensor([0, 1, 2, 128, 255], dtype=torch.uint8).view(torch.bool)
+    for gone in (False, True):
+        found = kept_rows(marks, ptr_from_counts([5]), gone=gone, within=marks)
+        assert found.keep.view(torch.uint8).tolist() == ([0] * 5 if gone else [0, 1, 1, 1, 1])
+        assert found.sums.tolist() == kept_rows(torch.full((4,), not gone), ptr_from_counts([4])).sums.tolist()
+
+
+@few
+@given(data=st.data())
+def test_what_is_kept_of_some_rows_is_told_as_if_there_were_no_others(data):
+    counts = data.draw(st.lists(st.integers(0, 200), min_size=1, max_size=4))
+    some, marks = (
+        torch.tensor(data.draw(st.lists(st.booleans(), min_size=sum(counts), max_size=sum(counts)))).bool()
+        for _ in range(2)
+    )
+    ptr = ptr_from_counts(counts)
+    found = kept_rows(marks, ptr, within=some)
+    alone = kept_rows(marks[some], ptr_after_mask(some, ptr))
+    assert torch.equal(found.keep[some], alone.keep)
+    assert not found.keep[~some].any()
+    assert torch.equal(found.ptr, alone.ptr)
+    assert torch.equal(found.sums, alone.sums)
 
 
 def test_rows_of_runs_equal_the_reference():

@@ -82,13 +82,17 @@ PC_EXPORT int32_t pc_register_depth(const pc_context* context, const float* dept
 
 // -- rows of fields, and points under maps ----------------------------------------------------------------------------
 
-// mask (rows,) -> starts (pieces + 1,): the true rows before each piece of 16384 rows, and their number.
-PC_EXPORT int32_t pc_count_kept(const pc_context* context, const uint8_t* mask, int64_t rows, int64_t* starts);
+// Which rows a decision leaves: keep (N,) becomes 1 where marks (N,) are true, or, with `gone`, are not, and `within`
+// (N,) is true, which may be null. Also the row pointers of what is kept, kept_ptr (clouds + 1,), and sums (clouds,),
+// which tell what is kept of the rows within.
+PC_EXPORT int32_t pc_kept_rows(const pc_context* context, const uint8_t* marks, int64_t gone, const uint8_t* within,
+                               const int64_t* ptr, int64_t num_clouds, uint8_t* keep, int64_t* kept_ptr, int64_t* sums);
 
-// Copy the rows where the mask is true; starts are those of pc_count_kept. Rows may be picked within their own memory.
-PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, int64_t rows, const int64_t* starts,
+// Copy the rows where the mask is true, if there is room for so many; *kept becomes their number. Rows may be picked
+// within their own memory.
+PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, int64_t rows, int64_t room,
                                int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
-                               const int64_t* picked);
+                               const int64_t* picked, int64_t* kept);
 
 // Copy the rows of clouds where the mask kept (N,) is true, from where each cloud has those of a field: sources
 // (fields, clouds), addresses. Those of a cloud go to row kept_ptr[cloud] of each field's picked.

@@ -2,13 +2,12 @@
 #include <cstring>
 #include <type_traits>
 
+#include "pc/rows/kept.hpp"
 #include "pc/rows/runs.hpp"
 #include "pc/threads.hpp"
 
 namespace pc::rows {
 namespace {
-
-constexpr int64_t kRowsPerPiece = 16384;
 
 // Fields of N rows and their picked rows. Rows are copied as bytes, so any dtype and shape will do.
 struct Fields {
@@ -50,7 +49,7 @@ void copy_runs(const char* source, int64_t bytes, const Run* runs, int64_t num_r
   }
 }
 
-// Copy the rows of a mask one after another, likewise; rows of one word, or three.
+// Copy the rows of a mask one after another, likewise; rows of one word, two or three.
 template <int kWords>
 void copy_kept(const char* source, const uint8_t* mask, int64_t first, int64_t last, char* picked) {
   constexpr int64_t kBytes = 4 * kWords;
@@ -66,27 +65,32 @@ void copy_kept(const char* source, const uint8_t* mask, int64_t first, int64_t l
 }  // namespace
 }  // namespace pc::rows
 
-PC_EXPORT int32_t pc_count_kept(const pc_context* context, const uint8_t* mask, int64_t rows, int64_t* starts) {
+PC_EXPORT int32_t pc_kept_rows(const pc_context* context, const uint8_t* marks, int64_t gone, const uint8_t* within,
+                               const int64_t* ptr, int64_t num_clouds, uint8_t* keep, int64_t* kept_ptr,
+                               int64_t* sums) {
   using namespace pc;
   using namespace pc::rows;
-  return guarded([&] {
-    starts[0] = 0;
-    parallel_for(*context, rows, kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
-      int64_t kept = 0;
-      for (int64_t row = first; row < last; ++row) kept += mask[row] != 0;
-      starts[first / kRowsPerPiece + 1] = kept;
-    });
-    const int64_t pieces = (rows + kRowsPerPiece - 1) / kRowsPerPiece;
-    for (int64_t piece = 0; piece < pieces; ++piece) starts[piece + 1] += starts[piece];
-  });
+  return guarded([&] { mark_kept(*context, marks, gone != 0, within, ptr, num_clouds, {keep, kept_ptr, sums}); });
 }
 
-PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, int64_t rows, const int64_t* starts,
+PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, int64_t rows, int64_t room,
                                int64_t num_fields, const int64_t* sources, const int64_t* row_bytes,
-                               const int64_t* picked) {
+                               const int64_t* picked, int64_t* kept) {
   using namespace pc;
   using namespace pc::rows;
   return guarded([&] {
+    ScratchFrame scratch;
+    const int64_t pieces = (rows + kRowsPerPiece - 1) / kRowsPerPiece;
+    int64_t* starts = scratch.take<int64_t>(pieces + 1);
+    starts[0] = 0;
+    parallel_for(*context, rows, kRowsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+      int64_t count = 0;
+      for (int64_t row = first; row < last; ++row) count += mask[row] != 0;
+      starts[first / kRowsPerPiece + 1] = count;
+    });
+    for (int64_t piece = 0; piece < pieces; ++piece) starts[piece + 1] += starts[piece];
+    *kept = starts[pieces];
+    if (*kept > room) return;
     const Fields fields{num_fields, sources, row_bytes, picked};
     bool in_place = false;
     for (int64_t f = 0; f < num_fields; ++f) in_place |= sources[f] == picked[f];
@@ -99,6 +103,7 @@ PC_EXPORT int32_t pc_keep_rows(const pc_context* context, const uint8_t* mask, i
       fields.each([&](const char* source, int64_t row_size, char* to) {
         to += start * row_size;
         if (row_size == 12) return copy_kept<3>(source, mask, first, last, to);
+        if (row_size == 8) return copy_kept<2>(source, mask, first, last, to);
         if (row_size == 4) return copy_kept<1>(source, mask, first, last, to);
         if (num_runs < 0) num_runs = find_runs(mask, first, last, runs);
         copy_runs(source, row_size, runs, num_runs, to);
@@ -123,6 +128,8 @@ PC_EXPORT int32_t pc_gather_kept(const pc_context* context, const int64_t* ptr, 
           char* to = reinterpret_cast<char*>(picked[f]) + kept_ptr[cloud] * row_bytes[f];
           if (row_bytes[f] == 12) {
             copy_kept<3>(source, mask, 0, count, to);
+          } else if (row_bytes[f] == 8) {
+            copy_kept<2>(source, mask, 0, count, to);
           } else if (row_bytes[f] == 4) {
             copy_kept<1>(source, mask, 0, count, to);
           } else {

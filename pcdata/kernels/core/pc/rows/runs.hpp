@@ -44,12 +44,12 @@ inline int64_t pack_rows(const char* from, const uint8_t* mask, int64_t count, i
   int64_t kept = 0, row = 0;
 #if defined(PC_AVX512)
   // Of 16 rows a bit each, and of all words of a row the same.
-  constexpr uint64_t kFirstWords = kWords == 3 ? 0x249249249249u : 0xFFFFu;
-  static_assert(kWords == 1 || kWords == 3);
+  constexpr uint64_t kFirstWords = kWords == 3 ? 0x249249249249u : kWords == 2 ? 0x55555555u : 0xFFFFu;
+  static_assert(kWords >= 1 && kWords <= 3);
   for (; row + kLanes <= count; row += kLanes) {
     const __m128i bytes = _mm_loadu_si128(reinterpret_cast<const __m128i*>(mask + row));
     const uint64_t bits = _mm_test_epi8_mask(bytes, bytes);
-    const uint64_t words = _pdep_u64(bits, kFirstWords) * (kWords == 3 ? 7 : 1);
+    const uint64_t words = _pdep_u64(bits, kFirstWords) * ((uint64_t{1} << kWords) - 1);
     int32_t* to = packed + kWords * kept;
     for (int part = 0; part < kWords; ++part) {
       const auto lanes = load<Int32Register>(from + 4 * (kWords * row + kLanes * part));
