@@ -84,6 +84,8 @@ def read_together(tensors: Sequence[Tensor]) -> list[list[Any]]:
     if not tensors:
         return []
     flat = [tensor.reshape(-1).long() for tensor in tensors]
+    if tensors[0].is_cpu or len(flat) == 1:
+        return [values.tolist() for values in flat]
     whole = torch.cat(flat).tolist()
     ends = [0]
     for values in flat:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Collection, Sequence
 from typing import Annotated, Any
 
@@ -140,8 +141,8 @@ class Deproject(Transform):
     def cloud_of(self, data: DepthFrame, own: Deprojected) -> PointCloud:
         """Return the points with all that the capture, which is checked, knows about them."""
         intrinsics, distortion = self.cameras_of(data)
-        identity = torch.eye(4, dtype=torch.float64, device="cpu").repeat(data.num_views, 1, 1)
-        frames = {CAMERA_FRAME: uploaded(identity, data.device)}
+        identity = _identities(data.num_views)
+        frames = {CAMERA_FRAME: uploaded(identity.clone(), data.device)}
         if data.world_from_camera is not None and data.frame_id is not None:
             frames[data.frame_id] = data.world_from_camera
         history = tuple(data.provenance.get("history", ()))
@@ -168,6 +169,12 @@ class Deproject(Transform):
             history=(history,) * data.num_views,
             recorded_signals={name: signal.repeated(data.num_views) for name, signal in data.recorded_signals.items()},
         )
+
+
+@functools.lru_cache(maxsize=16)
+def _identities(count: int) -> Tensor:
+    """Return (count, 4, 4) float64, to be copied."""
+    return torch.eye(4, dtype=torch.float64, device="cpu").repeat(count, 1, 1)
 
 
 def _metas(frame: DepthFrame) -> tuple[dict[str, Any], ...]:

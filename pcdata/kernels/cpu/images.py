@@ -6,9 +6,11 @@ and all that goes along with them, where they belong.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -92,8 +94,7 @@ def deproject_into_box(
     if images_fit(depth, intrinsics, distortion, colors, images) and region_fits(depth, matrix, mask):
         cameras = _Cameras.of(depth, intrinsics, distortion)
         matrix = None if matrix is None else matrix.double().contiguous()
-        corners = depth.new_tensor(lower), depth.new_tensor(upper)
-        chosen = cameras.choose(depth_limits(near, far), mask, matrix, *corners)
+        chosen = cameras.choose(depth_limits(near, far), mask, matrix, *_corners(tuple(lower), tuple(upper)))
     if chosen is None:
         region = {"matrix": matrix, "lower": lower, "upper": upper, "near": near, "far": far, "mask": mask}
         return INNER["deproject_into_box"].reference(depth, intrinsics, distortion, colors, images, **region)
@@ -164,15 +165,23 @@ class _Cameras:
         ]
         copied = [((count, *image.shape[3:]), image.dtype) for image in sources.values()]
         points, pixel_index, rgb, *rows = room_for(*core, *copied)
-        pixel_bytes = numbers([image.nbytes // self.depth.numel() for image in sources.values()])
+        copying: tuple[Any, ...] = 0, None, None, None
+        if sources:
+            pixel_bytes = numbers([image.nbytes // self.depth.numel() for image in sources.values()])
+            copying = len(sources), addresses(sources.values()), pixel_bytes, addresses(rows)
         call(
             "pc_deproject",
             *(self.depth, views, height, width, *self.rays, matrix, chosen.keep, chosen.starts),
-            *(points, pixel_index, over_all_views, _contiguous(colors), rgb),
-            *(len(sources), addresses(sources.values()), pixel_bytes, addresses(rows)),
+            *(points, pixel_index, over_all_views, _contiguous(colors), rgb, *copying),
         )
         ptr = chosen.starts[::height].clone()
         return Deprojected(points, ptr, pixel_index, None if colors is None else rgb, dict(zip(sources, rows)))
+
+
+@functools.lru_cache(maxsize=64)
+def _corners(*corners: tuple[float, ...]) -> tuple[Tensor, ...]:
+    """Return the corners of a box, float32, as the core reads them."""
+    return tuple(torch.tensor(corner, dtype=torch.float32, device="cpu") for corner in corners)
 
 
 def _contiguous(tensor: Tensor | None) -> Tensor | None:

@@ -336,9 +336,9 @@ def _mean_to_nearest(queries: Tensor, queries_ptr: Tensor, points: Tensor, ptr: 
 
 
 def _rows(points: Tensor, ptr: Tensor) -> tuple[Tensor, Tensor]:
-    if len(points) > _MAX_ROWS:
+    if points.shape[0] > _MAX_ROWS:
         raise ValueError(f"the compiled core takes at most {_MAX_ROWS} points in a call, got {len(points)}")
-    return points.detach().contiguous(), ptr.contiguous()
+    return (points.detach() if points.requires_grad else points).contiguous(), ptr.contiguous()
 
 
 def _reachable(count: int, points: Tensor) -> int:
@@ -346,6 +346,7 @@ def _reachable(count: int, points: Tensor) -> int:
     return min(count, max(1, len(points)))
 
 
+@functools.lru_cache(maxsize=256)
 def _limit(radius: float | None) -> float:
     return float(largest_squared(radius, torch.device("cpu")))
 

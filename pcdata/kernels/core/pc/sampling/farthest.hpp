@@ -101,19 +101,20 @@ class FarthestSampler {
   // Write further picks (rows), until `wanted` are taken or the work is worth `budget` leaves; return how many there
   // are now. Call it again to go on.
   int64_t advance(int64_t* picks, int64_t taken, int64_t wanted, int64_t budget) {
-    const Group& root = levels_.back().groups[0];
+    int64_t next = levels_.back().groups[0].farthest();
     if (taken == 0) picks[taken++] = 0;
     while (taken < wanted && budget > 0) {
-      const Pick pick = pick_of(root.farthest());
+      const Pick pick = pick_of(next);
       picks[taken++] = pick.row;
-      budget -= visit(levels_.size() - 1, 0, pick);
+      next = visit(levels_.size() - 1, 0, pick, budget);
     }
     return taken;
   }
 
  private:
-  static constexpr int32_t kTaken = -1;           // below the bits of every distance
-  static constexpr int32_t kUnseen = 0x7F800000;  // infinity
+  static constexpr int32_t kTaken = -1;                                       // below the bits of every distance
+  static constexpr int32_t kUnseen = 0x7F800000;                              // infinity
+  static constexpr int64_t kAllTaken = int64_t{kTaken} * (int64_t{1} << 32);  // the key of a leaf without other points
 
   struct Pick {
     float x, y, z;
@@ -126,25 +127,33 @@ class FarthestSampler {
     int32_t nearest[kLeaf];  // bits of the squared distance to the nearest pick, or kTaken
     uint32_t row[kLeaf];
 
-    // Take note of a pick; return the key of the leaf's farthest point.
-    int64_t update(const Pick& pick) {
+    // Take note of a pick, which is one of the leaf's own or not; return the key of the leaf's farthest point.
+    [[gnu::always_inline]] int64_t update(const Pick& pick, bool is_own) {
+      if (is_own) mark_taken(pick.row);
       Int32Register far{};
       for (int i = 0; i < kLeaf; i += kLanes) {
         const FloatRegister squared =
             squared_length(load<FloatRegister>(x + i) - pick.x, load<FloatRegister>(y + i) - pick.y,
                            load<FloatRegister>(z + i) - pick.z);
         // Distances are not negative, so their bits compare as they do.
-        Int32Register now = minimum(reinterpret_cast<Int32Register>(squared), load<Int32Register>(nearest + i));
-        now = load<Uint32Register>(row + i) == pick.row ? Int32Register{} + kTaken : now;
-        store(nearest + i, now);
-        far = i == 0 ? now : maximum(far, now);
+        const Int32Register own = minimum(reinterpret_cast<Int32Register>(squared), load<Int32Register>(nearest + i));
+        store(nearest + i, own);
+        far = i == 0 ? own : maximum(far, own);
       }
       const int32_t farthest = highest_lane<int32_t>(far);
-      const Uint32Register none = Uint32Register{} + UINT32_MAX;
-      Uint32Register rows = none;
+      if (farthest == kTaken) return kAllTaken;
+      uint32_t those = 0;
       for (int i = 0; i < kLeaf; i += kLanes)
-        rows = minimum(rows, load<Int32Register>(nearest + i) == farthest ? load<Uint32Register>(row + i) : none);
-      return int64_t{farthest} * (int64_t{1} << 32) + static_cast<uint32_t>(~lowest_lane<uint32_t>(rows));
+        those |= equal(load<Int32Register>(nearest + i), Int32Register{} + farthest).bits() << i;
+      uint32_t lowest = row[__builtin_ctz(those)];
+      for (those &= those - 1; those != 0; those &= those - 1) lowest = std::min(lowest, row[__builtin_ctz(those)]);
+      return int64_t{farthest} * (int64_t{1} << 32) + static_cast<uint32_t>(~lowest);
+    }
+
+   private:
+    [[gnu::noinline]] void mark_taken(uint32_t picked) {
+      for (int i = 0; i < kLeaf; ++i)
+        if (row[i] == picked) nearest[i] = kTaken;
     }
   };
 
@@ -156,8 +165,7 @@ class FarthestSampler {
 
     void set_key(int child, int64_t value) {
       key[child] = value;
-      const auto bits = static_cast<int32_t>(value >> 32);
-      bound[child] = bits < 0 ? -1.0f : float_of(bits);  // nothing is nearer than a box of taken points
+      bound[child] = float_of(static_cast<int32_t>(value >> 32));  // NaN or -0 of taken points: nothing is nearer
     }
     void set_unreachable(int child) {
       for (int axis = 0; axis < 3; ++axis) low[axis][child] = high[axis][child] = 0;
@@ -177,6 +185,17 @@ class FarthestSampler {
     int64_t farthest() const {
       auto best = load<Int64Register>(key);
       for (int i = kLanes / 2; i < kFan; i += kLanes / 2) best = maximum(load<Int64Register>(key + i), best);
+      return highest_lane<int64_t>(best);
+    }
+
+    // The same of all but some children.
+    int64_t farthest_beside(uint32_t children) const {
+      Int64Register bit, best = Int64Register{} + INT64_MIN;
+      for (int i = 0; i < kLanes / 2; ++i) bit[i] = int64_t{1} << i;
+      for (int i = 0; i < kFan; i += kLanes / 2) {
+        const Int64Register is_one = (Int64Register{} + int64_t{children >> i}) & bit;
+        best = maximum(is_one != 0 ? best : load<Int64Register>(key + i), best);
+      }
       return highest_lane<int64_t>(best);
     }
 
@@ -247,33 +266,32 @@ class FarthestSampler {
       group.low[axis][child] = lowest_lane<float>(low);
       group.high[axis][child] = highest_lane<float>(high);
     }
-    group.set_key(child, leaf.update(first));
+    group.set_key(child, leaf.update(first, true));
   }
 
-  // Update what a pick changes below one group; return the number of leaves and groups visited.
-  int64_t visit(size_t at, int64_t index, const Pick& pick) {
+  // Update what a pick changes below one group, and count the leaves and groups visited down from the budget. Returns
+  // the key of its farthest point, which is not read from what was just written: that would wait for it.
+  int64_t visit(size_t at, int64_t index, const Pick& pick, int64_t& budget) {
     Group& group = levels_[at].groups[index];
     const uint32_t reached = group.reached(pick);
-    int64_t visited = 1;
     for (uint32_t rest = reached; rest != 0; rest &= rest - 1) {
       const int64_t child = index * kFan + __builtin_ctz(rest);
       if (at == 0)
-        prefetch(leaves_[child]);
+        __builtin_prefetch(&leaves_[child]);  // the rest follows by itself
       else
         prefetch(levels_[at - 1].groups[child]);
     }
+    int64_t farthest = group.farthest_beside(reached);
+    budget -= 1 + (at == 0 ? __builtin_popcount(reached) : 0);
     for (uint32_t rest = reached; rest != 0; rest &= rest - 1) {
       const int child = __builtin_ctz(rest);
       const int64_t below = index * kFan + child;
-      if (at == 0) {
-        group.set_key(child, leaves_[below].update(pick));
-        ++visited;
-      } else {
-        visited += visit(at - 1, below, pick);
-        group.set_key(child, levels_[at - 1].groups[below].farthest());
-      }
+      const int64_t key =
+          at == 0 ? leaves_[below].update(pick, group.key[child] == pick.key) : visit(at - 1, below, pick, budget);
+      group.set_key(child, key);
+      farthest = std::max(farthest, key);
     }
-    return visited;
+    return farthest;
   }
 
   const float* points_;
