@@ -179,7 +179,7 @@ def _identities(count: int) -> Tensor:
 
 def _metas(frame: DepthFrame) -> tuple[dict[str, Any], ...]:
     """Keep what is needed to trace each view's cloud to its capture and to deproject it again."""
-    cameras: Camera = with_tensors(frame.camera, on_host)
+    cameras: Camera = frame.camera if frame.device.type == "cpu" else with_tensors(frame.camera, on_host)
     poses = None if frame.world_from_camera is None else on_host(frame.world_from_camera).tolist()
     provenance = {name: value for name, value in frame.provenance.items() if name != "history"}
     metas = []
@@ -189,7 +189,9 @@ def _metas(frame: DepthFrame) -> tuple[dict[str, Any], ...]:
             {
                 "sample_id": frame.sample_id,
                 "capture_index": frame.capture_index,
-                "cameras": [{**cameras.view(view).to_dict(), "view": view, **pose}],
+                "cameras": [
+                    {**(cameras if frame.num_views == 1 else cameras.view(view)).to_dict(), "view": view, **pose}
+                ],
                 "provenance": {**provenance},
             }
         )

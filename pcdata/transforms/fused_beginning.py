@@ -85,11 +85,7 @@ def _run(
         limits = mask.near, mask.far, mask.mask_of(frame)
         frame = mask.recorded(frame, frame, {})
     if isinstance(flying, RemoveFlyingPixels):
-        # The confidence of what is kept stays.
-        depth, _ = without_flying_pixels(depth, None, flying.tolerance, flying.min_neighbors, limits)
-        limits = None
         frame = flying.recorded(frame, frame, {})
-    near, far, region = limits or (None, None, None)
     images, colors = deproject.images_of(frame), frame.colors
     aside = None
     if needed is not None and are_many(frame.depth.numel()):
@@ -106,6 +102,11 @@ def _run(
         moved = move.transform(bare, moves)
     crop.check_input(moved)
     matrix = moves.get("matrix")
+    # What the pixels go through follows at once, so that the core's threads need not be waked in between.
+    if isinstance(flying, RemoveFlyingPixels):  # the confidence of what is kept stays
+        depth, _ = without_flying_pixels(depth, None, flying.tolerance, flying.min_neighbors, limits)
+        limits = None
+    near, far, region = limits or (None, None, None)
     done = deproject_into_box(
         depth,
         *deproject.cameras_of(frame),
