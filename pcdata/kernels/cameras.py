@@ -9,6 +9,7 @@ import functools
 import math
 from collections.abc import Mapping
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -49,9 +50,14 @@ class _Key:
     """A small tensor that a cache can look up by value."""
 
     def __init__(self, tensor: Tensor) -> None:
-        here = on_host(tensor)
-        self.tensor = here.clone() if tensor.is_cpu else here
-        self.value = tensor.dtype, tensor.shape, self.tensor.numpy().tobytes()
+        array = on_host(tensor).numpy()
+        self.value = array.dtype, array.shape, array.tobytes()
+
+    @property
+    def tensor(self) -> Tensor:
+        """A copy in host memory."""
+        dtype, shape, content = self.value
+        return torch.from_numpy(np.ndarray(shape, dtype, content).copy())
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Key) and self.value == other.value

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.asked_later import is_set
-from pcdata.contracts.known import note
+from pcdata.contracts.known import FINITE, note
 from pcdata.contracts.on_host import on_host, uploaded
 from pcdata.errors import CaptureError, ConfigError
 from pcdata.functional.depth.deproject import Deprojected, deproject_images, pixel_rays
@@ -148,6 +148,8 @@ class Deproject(Transform):
         history = tuple(data.provenance.get("history", ()))
         extra = {name: rows for name, rows in own.rows.items() if name != "labels"}
         note(pixels_of_views(data.size), own.source_index, own.ptr)
+        viewpoint = uploaded(torch.zeros(data.num_views, 3, dtype=torch.float32, device="cpu"), data.device)
+        note(FINITE, viewpoint)
         return made(
             PointCloud,
             points=own.points,
@@ -161,7 +163,7 @@ class Deproject(Transform):
             extra=extra,
             kinds=self.kinds_of(extra),
             layout=None if distortion is not None else ImageLayout(size=data.size, intrinsics=intrinsics),
-            viewpoint=uploaded(torch.zeros(data.num_views, 3, dtype=torch.float32, device="cpu"), data.device),
+            viewpoint=viewpoint,
             source_from_cloud=uploaded(identity.clone(), data.device),
             source_frame=CAMERA_FRAME,
             frames=frames,

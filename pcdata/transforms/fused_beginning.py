@@ -7,6 +7,7 @@ provenance are those of the single steps, bit for bit; and whatever they would r
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Collection, Sequence
 
 import torch
@@ -144,11 +145,19 @@ def _run(
 
 def _nothing(frame: DepthFrame, colors: Tensor | None, images: dict[str, Tensor]) -> Deprojected:
     """Return what no reading at all gives."""
-    depth, views = frame.depth, frame.num_views
+    kinds = tuple([(name, image.dtype, image.shape[3:]) for name, image in images.items()])
+    return _empty(frame.device, frame.num_views, colors is not None, kinds)
+
+
+@functools.lru_cache(maxsize=64)
+def _empty(
+    device: torch.device, views: int, has_colors: bool, kinds: tuple[tuple[str, torch.dtype, torch.Size], ...]
+) -> Deprojected:
+    points = torch.empty((0, 3), dtype=torch.float32, device=device)
     return Deprojected(
-        points=depth.new_empty((0, 3)),
-        ptr=torch.zeros(views + 1, dtype=torch.int64, device=depth.device),
-        source_index=torch.empty(0, dtype=torch.int64, device=depth.device),
-        colors=None if colors is None else depth.new_empty((0, 3)),
-        rows={name: image.new_empty((0, *image.shape[3:])) for name, image in images.items()},
+        points=points,
+        ptr=torch.zeros(views + 1, dtype=torch.int64, device=device),
+        source_index=torch.empty(0, dtype=torch.int64, device=device),
+        colors=points if has_colors else None,
+        rows={name: torch.empty((0, *shape), dtype=dtype, device=device) for name, dtype, shape in kinds},
     )

@@ -156,7 +156,8 @@ class _Cameras:
     ) -> Deprojected:
         """Write the chosen points, moved by the matrix."""
         views, height, width = self.depth.shape
-        count = int(chosen.starts[-1])
+        bounds = chosen.starts.numpy()[::height].tolist()
+        count = bounds[-1]
         sources = {name: image.contiguous() for name, image in (images or {}).items()}
         core = [
             ((count, 3), torch.float32),
@@ -174,8 +175,9 @@ class _Cameras:
             *(self.depth, views, height, width, *self.rays, matrix, chosen.keep, chosen.starts),
             *(points, pixel_index, over_all_views, _contiguous(colors), rgb, *copying),
         )
-        ptr = chosen.starts[::height].clone()
-        return Deprojected(points, ptr, pixel_index, None if colors is None else rgb, dict(zip(sources, rows)))
+        return Deprojected(
+            points, numbers(bounds), pixel_index, None if colors is None else rgb, dict(zip(sources, rows))
+        )
 
 
 @functools.lru_cache(maxsize=64)
