@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from typing import Annotated, Any
 
 import torch
@@ -36,6 +36,9 @@ from pcdata.transforms.field_types import (
     Unit,
     Vec3,
 )
+from pcdata.transforms.row_sums import sums_when_read
+
+_FEW_ROWS = 1 << 14  # which a history may hold until somebody reads it
 
 
 class VoxelDownsample(Transform):
@@ -156,6 +159,13 @@ class _Sample(SelectTransform, abstract=True):
         fields = chosen.fields()
         filler = fillers(fields, chosen.kinds)
         return chosen.with_fields(**{name: _blanked(value, blank, filler[name]) for name, value in fields.items()})
+
+    def told_rows(self, data: PointCloud, params: Params) -> Sequence[int] | None:
+        """Leave it to who reads the history to look at a few rows."""
+        index = params["index"]
+        if self.decides_by != "rows" or index.shape[0] > _FEW_ROWS or not index.is_cpu:
+            return super().told_rows(data, params)
+        return sums_when_read(index, params["ptr"], data.ptr)
 
     def _fill_up(self, rows: Tensor, counts: list[int], wanted: list[int], seeds: list[int]) -> Tensor:
         """Lengthen the ``counts`` rows of every cloud to as many as are wanted."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, overload
 
 import torch
@@ -24,9 +24,16 @@ def row_sums(params: Mapping[str, Tensor], ptr: Tensor) -> Sequence[int] | None:
     values = {name: value for name, value in params.items() if name in PER_ROW and name != "ptr"}
     if not values:
         return None
+    kept = params.get("ptr")
     if ptr.device.type == "cpu":
-        return _sums(values, params.get("ptr"), ptr)
-    return _Later(values, params.get("ptr"), ptr)
+        return _sums(values, kept, ptr)
+    return _Later(len(ptr) - 1, lambda: _sums(values, kept, ptr))
+
+
+def sums_when_read(index: Tensor, kept: Tensor, ptr: Tensor) -> Sequence[int]:
+    """Return the same of rows (M,) int64 that nobody changes any more, cut by ``kept``: found out when it is read."""
+    ends, begun = bounds_of(kept), bounds_of(ptr)
+    return _Later(len(begun) - 1, lambda: checksums(index, ends, begun))
 
 
 def _sums(values: Mapping[str, Tensor], kept: Tensor | None, ptr: Tensor) -> list[int]:
@@ -43,16 +50,16 @@ def _sums(values: Mapping[str, Tensor], kept: Tensor | None, ptr: Tensor) -> lis
 
 
 class _Later(Sequence[int]):
-    """The numbers of B clouds on another device."""
+    """The numbers of B clouds, found out when somebody reads them."""
 
-    def __init__(self, values: Mapping[str, Tensor], kept: Tensor | None, ptr: Tensor) -> None:
-        self._held: tuple[Mapping[str, Tensor], Tensor | None, Tensor] | None = (values, kept, ptr)
-        self._length = len(ptr) - 1
+    def __init__(self, length: int, find: Callable[[], list[int]]) -> None:
+        self._length = length
+        self._find: Callable[[], list[int]] | None = find
         self._read: list[int] = []
 
     def _listed(self) -> list[int]:
-        if self._held is not None:
-            self._read, self._held = _sums(*self._held), None
+        if self._find is not None:
+            self._read, self._find = self._find(), None  # it holds what is looked at
         return self._read
 
     def __len__(self) -> int:

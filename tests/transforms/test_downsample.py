@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+import dataclasses
+import pickle
+
 import pytest
 import torch
 
@@ -232,3 +235,16 @@ def test_what_a_short_cloud_becomes_must_be_a_known_word():
         ConfigError, match=r"FarthestPointSample.if_short: .*'error', 'repeat', 'tile', 'zeros' or 'keep'"
     ):
         FarthestPointSample(num_points=8, if_short="crop")
+
+
+def test_what_tells_sampled_rows_is_found_out_when_it_is_read():
+    cloud = PointCloud(points=torch.rand(300, 3, generator=seeded(1)), ptr=torch.tensor([0, 120, 300]), frame_id="base")
+    step = FarthestPointSample(num_points=50)
+    given = cloud.ptr.clone()
+    made = step(dataclasses.replace(cloud, ptr=given))
+    given.zero_()  # whoever gave it may use it again
+    told = [entries[-1]["rows"] for entries in made.history]
+    alone = [step(one).history[0][-1]["rows"] for one in cloud]
+    assert told == alone
+    assert pickle.loads(pickle.dumps(step(cloud))).history == step(cloud).history
+    assert step.replay(cloud, step(cloud).history).history == step(cloud).history
