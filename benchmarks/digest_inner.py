@@ -46,7 +46,6 @@ def _depth_filters() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     yield "temporal_step", "values", lambda: ((depth, None, last, seen, 0.4, 0.01, 3), {})
     yield "temporal_step", "reciprocals", lambda: ((depth, scale, last, seen, 0.4, 0.1, 5), {})
     yield "without_flying_pixels", "confidence", lambda: ((depth, seen % 4, 0.02, 3), {})
-    yield "without_flying_pixels", "masked", lambda: ((depth, None, 0.02, 3, (0.5, 0.9, seen > 99)), {})
     yield "look_at_depth", "same", lambda: ((depth, depth.clone()), {})
     yield "look_at_depth", "other", lambda: ((depth, last), {})
     yield "fill_rows", "three", lambda: ((depth, 3), {})
@@ -75,10 +74,10 @@ def _images(lens: str) -> Arguments:
     return (frame.depth, frame.camera.intrinsics, distortion, frame.colors, more), {}
 
 
-def _into_box(lens: str, *, moved: bool) -> Arguments:
+def _into_box(lens: str, *, moved: bool, flying: tuple[float, int] | None = None) -> Arguments:
     box = {"lower": (-0.3, -0.3, 0.0), "upper": (0.3, 0.2, 0.9), "near": 0.2, "far": 1.5, "mask": _mask()}
     matrix = rendered(2, 5).world_from_camera if moved else None
-    return _images(lens)[0], {**box, "matrix": matrix}
+    return _images(lens)[0], {**box, "matrix": matrix, "flying": flying}
 
 
 _ROWS = np.arange(60, dtype=np.float32).reshape(20, 3)  # of five records
@@ -138,6 +137,11 @@ def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
         yield "deproject_images", lens, partial(_images, lens)
         yield "deproject_into_box", f"{lens} camera", partial(_into_box, lens, moved=False)
         yield "deproject_into_box", f"{lens} base", partial(_into_box, lens, moved=True)
+        yield (
+            "deproject_into_box",
+            f"{lens} without flying pixels",
+            partial(_into_box, lens, moved=True, flying=(0.01, 3)),
+        )
     yield "nearest_chunks", "radius", lambda: ((points(400, 3), ptr_of(400), 6), {"radius": 0.03})
     asked = _queries({})
     searched = asked.pop("points"), asked.pop("ptr"), 5

@@ -16,8 +16,8 @@ from torch import Tensor
 from pcdata.contracts.known import FINITE, note
 from pcdata.contracts.on_host import counts_of, read_together
 from pcdata.errors import PcdataError
-from pcdata.functional.depth.deproject import Deprojected, deproject_into_box
-from pcdata.functional.depth.flying_pixels import without_flying_pixels
+from pcdata.functional.depth.boxed import deproject_into_box
+from pcdata.functional.depth.deproject import Deprojected
 from pcdata.functional.image_grid import pixels_rise
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.structures.image_layout import pixels_of_views
@@ -81,9 +81,9 @@ def _run(
     assert isinstance(crop, CropWorkspace)
     assert not isinstance(crop.lower, str)  # is_plain
     assert not isinstance(crop.upper, str)
-    depth, limits = frame.depth, None
+    near = far = region = None
     if isinstance(mask, MaskDepth):
-        limits = mask.near, mask.far, mask.mask_of(frame)
+        near, far, region = mask.near, mask.far, mask.mask_of(frame)
         frame = mask.recorded(frame, frame, {})
     if isinstance(flying, RemoveFlyingPixels):
         frame = flying.recorded(frame, frame, {})
@@ -103,13 +103,8 @@ def _run(
         moved = move.transform(bare, moves)
     crop.check_input(moved)
     matrix = moves.get("matrix")
-    # What the pixels go through follows at once, so that the core's threads need not be waked in between.
-    if isinstance(flying, RemoveFlyingPixels):  # the confidence of what is kept stays
-        depth, _ = without_flying_pixels(depth, None, flying.tolerance, flying.min_neighbors, limits)
-        limits = None
-    near, far, region = limits or (None, None, None)
     done = deproject_into_box(
-        depth,
+        frame.depth,
         *deproject.cameras_of(frame),
         colors,
         images,
@@ -119,6 +114,8 @@ def _run(
         near=near,
         far=far,
         mask=region,
+        # The confidence of what is kept stays.
+        flying=(flying.tolerance, flying.min_neighbors) if isinstance(flying, RemoveFlyingPixels) else None,
     )
     if done is None:
         return None

@@ -6,7 +6,7 @@ OpenCV axes (x right, y down, z forward). Integer pixel coordinates are pixel ce
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -19,13 +19,8 @@ from pcdata.contracts.tensors import check_depths, check_tensors
 from pcdata.errors import CaptureError
 from pcdata.functional.rows import (
     cloud_of_rows,
-    counts_from_ptr,
-    inside_box,
-    pick_rows,
-    ptr_after_mask,
     ptr_from_counts,
     rows_of_mask,
-    transform_points,
 )
 from pcdata.geometry.lens import distort_normalized, fold_radius, undistort_normalized
 from pcdata.geometry.lens_models import check_distortion
@@ -105,40 +100,6 @@ def deproject_images(
     rgb = None if colors is None else colors.reshape(-1, 3)[source_index].float() / 255
     rows = {name: image.flatten(0, 2)[source_index] for name, image in images.items()}
     return Deprojected(points, ptr, source_index, rgb, rows)
-
-
-@inner
-def deproject_into_box(
-    depth: Tensor,
-    intrinsics: Tensor,
-    distortion: Tensor | None,
-    colors: Tensor | None,
-    images: Mapping[str, Tensor],
-    *,
-    matrix: Tensor | None,  # (V, 4, 4) float64, moves the points of each view; None = they stay
-    lower: Sequence[float],
-    upper: Sequence[float],
-    near: float | None,
-    far: float | None,
-    mask: Tensor | None,
-) -> tuple[Deprojected, Tensor] | None:
-    """Run :func:`mask_depth`, :func:`deproject_images`, a motion and a box as one step; None if a point is not finite.
-
-    Returns:
-        What is inside the box, moved, and how many points each view had before the box, (V,) int64.
-    """
-    whole = deproject_images(mask_depth(depth, near, far, mask), intrinsics, distortion, colors, images)
-    points = whole.points if matrix is None else transform_points(whole.points, whole.ptr, matrix)
-    inside = inside_box(points, lower, upper)
-    if inside is None:
-        return None
-    fields = {"points": points, "source_index": whole.source_index}
-    kept = pick_rows(fields if whole.colors is None else fields | {"colors": whole.colors}, inside)
-    ptr = ptr_after_mask(inside, whole.ptr)
-    inner_part = Deprojected(
-        kept["points"], ptr, kept["source_index"], kept.get("colors"), pick_rows(whole.rows, inside)
-    )
-    return inner_part, counts_from_ptr(whole.ptr)
 
 
 def pixel_rays(

@@ -9,11 +9,8 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_positive
-from pcdata.functional.depth.deproject import mask_depth
 
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))  # half of the eight: each pair of neighbors is compared once
-
-Limits = tuple[float | None, float | None, Tensor | None]  # near, far, mask as mask_depth takes them
 
 
 @op(
@@ -66,13 +63,9 @@ def flying_pixel_mask(
 
 @inner
 def without_flying_pixels(
-    depth: Tensor, confidence: Tensor | None, tolerance: float, min_neighbors: int, limits: Limits | None = None
+    depth: Tensor, confidence: Tensor | None, tolerance: float, min_neighbors: int
 ) -> tuple[Tensor, Tensor | None]:
-    """Return depth (V, H, W) with 0 at its flying pixels, and its confidence (V, H, W) uint8, if any, as well.
-
-    With ``limits`` the depth is what :func:`mask_depth` makes of it.
-    """
-    depth = depth if limits is None else mask_depth(depth, *limits)
+    """Return depth (V, H, W) with 0 at its flying pixels, and its confidence (V, H, W) uint8, if any, as well."""
     flying = flying_pixel_mask(depth, tolerance=tolerance, min_neighbors=min_neighbors)
     marks = None if confidence is None else torch.where(flying, 0, confidence).to(torch.uint8)
     return torch.where(flying, 0.0, depth), marks

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -9,12 +11,9 @@ import pcdata.functional.depth.flying_pixels
 import pcdata.functional.image_clusters
 import pcdata.functional.table_surface  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, kernel
-from pcdata.functional.depth.deproject import mask_depth
-from pcdata.functional.depth.flying_pixels import Limits
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.radius import squared_radius
 from pcdata.functional.rows import counts_from_ptr
-from pcdata.kernels.cameras import depth_limits
 from pcdata.kernels.cpu.native import call, room
 
 # The core numbers the rows of one cloud with 31 bits.
@@ -31,17 +30,14 @@ def flying_pixel_mask(depth: Tensor, *, tolerance: float, min_neighbors: int) ->
 
 @kernel("without_flying_pixels", "cpu")
 def without_flying_pixels(
-    depth: Tensor, confidence: Tensor | None, tolerance: float, min_neighbors: int, limits: Limits | None = None
+    depth: Tensor, confidence: Tensor | None, tolerance: float, min_neighbors: int
 ) -> tuple[Tensor, Tensor | None]:
     """Write what is left instead of a mask."""
-    near, far, mask = limits or (None, None, None)
-    if mask is not None and (mask.shape != depth.shape or mask.dtype is not torch.bool):
-        depth, limits, mask = mask_depth(depth, near, far, mask), None, None
     kept, rule = room(depth.shape, torch.float32), (float(tolerance), min_neighbors)
     marks = None if confidence is None else room(depth.shape, torch.uint8)
     was = None if confidence is None else confidence.contiguous()
-    within = limits is not None, *depth_limits(near, far), None if mask is None else mask.contiguous()
-    call("pc_without_flying_pixels", depth.contiguous(), *depth.shape, *within, *rule, was, kept, marks)
+    unmasked = False, 0.0, math.inf, None
+    call("pc_without_flying_pixels", depth.contiguous(), *depth.shape, *unmasked, *rule, was, kept, marks)
     return kept, marks
 
 

@@ -15,6 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+import pcdata.functional.depth.boxed  # noqa: F401 - the function must be registered before its kernel
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.depth.deproject import Deprojected, check_intrinsics
 from pcdata.functional.depth.looks import DepthLook
@@ -88,16 +89,20 @@ def deproject_into_box(
     near: float | None,
     far: float | None,
     mask: Tensor | None,
+    flying: tuple[float, int] | None = None,
 ) -> tuple[Deprojected, Tensor] | None:
     """Write only what is inside the box."""
     chosen = None
     if images_fit(depth, intrinsics, distortion, colors, images) and region_fits(depth, matrix, mask):
         cameras = _Cameras.of(depth, intrinsics, distortion)
         matrix = None if matrix is None else matrix.double().contiguous()
-        chosen = cameras.choose(depth_limits(near, far), mask, matrix, *_corners(tuple(lower), tuple(upper)))
+        corners = _corners(tuple(lower), tuple(upper))
+        chosen = cameras.choose(depth_limits(near, far), mask, matrix, *corners, flying=flying)
     if chosen is None:
-        region = {"matrix": matrix, "lower": lower, "upper": upper, "near": near, "far": far, "mask": mask}
-        return INNER["deproject_into_box"].reference(depth, intrinsics, distortion, colors, images, **region)
+        region = {"lower": lower, "upper": upper, "near": near, "far": far, "mask": mask, "flying": flying}
+        return INNER["deproject_into_box"].reference(
+            depth, intrinsics, distortion, colors, images, matrix=matrix, **region
+        )
     return cameras.deproject(chosen, matrix=matrix, colors=colors, images=images), chosen.readings
 
 
@@ -105,6 +110,7 @@ def deproject_into_box(
 class _Chosen:
     """Which pixels become points."""
 
+    depth: Tensor  # (V, H, W)
     keep: Tensor  # (V, H, W) bool
     readings: Tensor  # (V,) int64: those that the box decided about
     starts: Tensor  # (V * H + 1,) int64: where the points of each image row start
@@ -129,21 +135,32 @@ class _Cameras:
         matrix: Tensor | None = None,
         lower: Tensor | None = None,
         upper: Tensor | None = None,
+        *,
+        flying: tuple[float, int] | None = None,
     ) -> _Chosen | None:
-        """Decide about every pixel; None where there is none, or something wrong that the reference says best."""
+        """Decide about every pixel; None where there is none, or something wrong that the reference says best.
+
+        With ``flying``, a tolerance and a number of neighbors, of the pixels within the limits those that fly go first.
+        """
         if self.depth.numel() == 0:
             return None
-        views, height, width = self.depth.shape
-        keep = room(self.depth.shape, torch.bool)
+        depth, mask, (views, height, width) = self.depth, _contiguous(mask), self.depth.shape
+        keep = room(depth.shape, torch.bool)
         readings, possible = room(views, torch.int64), room(1, torch.int64)
         starts = room(views * height + 1, torch.int64)
+        if flying is not None:  # with nothing to do before the next call, for which the core's threads stay awake
+            tolerance, min_neighbors = flying
+            left = room(depth.shape, torch.float32)
+            rule = True, *limits, mask, float(tolerance), min_neighbors
+            call("pc_without_flying_pixels", depth, views, height, width, *rule, None, left, None)
+            depth, limits, mask = left, (0.0, math.inf), None
         call(
             "pc_choose_pixels",
-            *(self.depth, views, height, width, *self.rays),
-            *(*limits, _contiguous(mask), matrix, lower, upper),
+            *(depth, views, height, width, *self.rays),
+            *(*limits, mask, matrix, lower, upper),
             *(keep, readings, starts, possible),
         )
-        return _Chosen(keep, readings, starts) if possible else None
+        return _Chosen(depth, keep, readings, starts) if possible else None
 
     def deproject(
         self,
@@ -155,7 +172,7 @@ class _Cameras:
         images: Mapping[str, Tensor] | None = None,
     ) -> Deprojected:
         """Write the chosen points, moved by the matrix."""
-        views, height, width = self.depth.shape
+        views, height, width = chosen.depth.shape
         bounds = chosen.starts.numpy()[::height].tolist()
         count = bounds[-1]
         sources = {name: image.contiguous() for name, image in (images or {}).items()}
@@ -168,11 +185,11 @@ class _Cameras:
         points, pixel_index, rgb, *rows = room_for(*core, *copied)
         copying: tuple[Any, ...] = 0, None, None, None
         if sources:
-            pixel_bytes = numbers([image.nbytes // self.depth.numel() for image in sources.values()])
+            pixel_bytes = numbers([image.nbytes // chosen.depth.numel() for image in sources.values()])
             copying = len(sources), addresses(sources.values()), pixel_bytes, addresses(rows)
         call(
             "pc_deproject",
-            *(self.depth, views, height, width, *self.rays, matrix, chosen.keep, chosen.starts),
+            *(chosen.depth, views, height, width, *self.rays, matrix, chosen.keep, chosen.starts),
             *(points, pixel_index, over_all_views, _contiguous(colors), rgb, *copying),
         )
         return Deprojected(

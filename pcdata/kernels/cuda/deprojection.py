@@ -11,12 +11,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+import pcdata.functional.depth.boxed  # noqa: F401 - the function must be registered before its kernel
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.contracts.known import FINITE, note
 from pcdata.contracts.on_host import read_together, uploaded
 from pcdata.functional.depth.deproject import Deprojected, check_intrinsics
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.kernels.cameras import depth_limits, images_fit, rays_of_cameras, region_fits
+from pcdata.kernels.cuda.depth_filters import without_flying_pixels
 from pcdata.kernels.cuda.launching import Launcher, launcher_of
 
 _WORD = 32  # pixels
@@ -76,9 +78,13 @@ def deproject_into_box(
     near: float | None,
     far: float | None,
     mask: Tensor | None,
+    flying: tuple[float, int] | None = None,
 ) -> tuple[Deprojected, Tensor] | None:
     """Write only what is inside the box."""
     chosen = None
+    if flying is not None:
+        depth = without_flying_pixels(mask_depth(depth, near, far, mask), None, *flying)[0]
+        near = far = mask = None
     if images_fit(depth, intrinsics, distortion, colors, images) and region_fits(depth, matrix, mask):
         box = (*map(float, lower), *map(float, upper))
         moved = None if matrix is None else matrix.double().contiguous()

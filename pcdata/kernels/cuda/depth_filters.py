@@ -10,9 +10,7 @@ import pcdata.functional.depth.temporal
 import pcdata.functional.depth.window_filters  # noqa: F401 - functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, kernel
 from pcdata.contracts.on_host import uploaded
-from pcdata.functional.depth.deproject import mask_depth
 from pcdata.functional.depth.disparity import LINE_HOLE, smallest_edge
-from pcdata.functional.depth.flying_pixels import Limits
 from pcdata.functional.depth.temporal import PERSISTENCE_RULES
 from pcdata.functional.depth.window_filters import depth_scale, pixel_shares
 from pcdata.kernels.cuda.launching import launcher_of
@@ -93,10 +91,9 @@ def flying_pixel_mask(depth: Tensor, *, tolerance: float, min_neighbors: int) ->
 
 @kernel("without_flying_pixels", "cuda")
 def without_flying_pixels(
-    depth: Tensor, confidence: Tensor | None, tolerance: float, min_neighbors: int, limits: Limits | None = None
+    depth: Tensor, confidence: Tensor | None, tolerance: float, min_neighbors: int
 ) -> tuple[Tensor, Tensor | None]:
     """Write what is left instead of a mask."""
-    depth = depth if limits is None else mask_depth(depth, *limits)
     kept = torch.empty(depth.shape, dtype=torch.float32, device=depth.device)
     marks = None if confidence is None else torch.empty(depth.shape, dtype=torch.uint8, device=depth.device)
     given = depth.contiguous(), *depth.shape, tolerance, min_neighbors

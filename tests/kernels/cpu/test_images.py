@@ -142,6 +142,13 @@ def test_a_box_equals_the_reference(camera, moved):
     assert_same(ours, theirs)
     assert 0 < len(theirs[0].points) < int(theirs[1].sum())
     assert_same(*both("deproject_into_box", *cameras, None, {}, **region(*box, matrix=matrix)))
+    depth = 0.4 + depth.round(decimals=1)  # with surfaces, and readings that are none beside them
+    depth[:, ::3, ::5], depth[:, 1, 1:4] = 0.0, torch.tensor([math.nan, math.inf, -1.0])
+    for flying in ((0.02, 3), (0.3, 8)):
+        for limits in ({}, {"near": 0.5, "far": 1.2, "mask": mask.mT.contiguous().mT}):
+            limited = region(*box, matrix=matrix, **limits)
+            ours, theirs = both("deproject_into_box", depth, *cameras[1:], colors, images, **limited, flying=flying)
+            assert_same(ours, theirs)
 
 
 def test_a_point_on_a_face_is_inside():

@@ -8,8 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.functional.depth.boxed import deproject_into_box
 from pcdata.functional.depth.confidence import filled_confidence
-from pcdata.functional.depth.deproject import deproject_depth, deproject_images, deproject_into_box, mask_depth
+from pcdata.functional.depth.deproject import deproject_depth, deproject_images, mask_depth
 from pcdata.functional.depth.disparity import reciprocals, smoothed_images
 from pcdata.functional.depth.flying_pixels import without_flying_pixels
 from pcdata.functional.depth.holes import fill_rows, filled_images

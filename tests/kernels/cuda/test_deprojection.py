@@ -9,7 +9,8 @@ import torch
 
 from pcdata import functional as F
 from pcdata.errors import CaptureError
-from pcdata.functional.depth.deproject import deproject_images, deproject_into_box, mask_depth
+from pcdata.functional.depth.boxed import deproject_into_box
+from pcdata.functional.depth.deproject import deproject_images, mask_depth
 from pcdata.rng import seeded
 from tests.factories import assert_same
 from tests.kernels.cuda import harness
@@ -49,10 +50,13 @@ def test_a_box_takes_what_the_reference_takes_with_all_that_goes_along(shape, is
     region = {"matrix": matrix, "lower": (-0.2, -0.1, 0.5), "upper": (0.4, 0.3, 1.9), "near": 0.5, "far": 2.0}
     mask = torch.rand(shape, generator=seeded(3)) < 0.8
     given = depth, intrinsics, None, colors, along
-    found = deproject_into_box(*given, **region, mask=mask, backend=harness.BACKEND)
-    expected = deproject_into_box(*given, **region, mask=mask, backend="torch")
-    for one, other in zip(found, expected, strict=True):
-        equal(one, other)
+    for flying in (None, (0.01, 4)):
+        found, expected = (
+            deproject_into_box(*given, **region, mask=mask, flying=flying, backend=backend)
+            for backend in (harness.BACKEND, "torch")
+        )
+        for one, other in zip(found, expected, strict=True):
+            equal(one, other)
     whole, wanted = (deproject_images(*given, backend=backend) for backend in (harness.BACKEND, "torch"))
     equal(whole, wanted)
 
