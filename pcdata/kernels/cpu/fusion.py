@@ -20,6 +20,7 @@ from pcdata.kernels.cpu.native import address, call, numbers, room, room_for
 
 _FEWEST_SLOTS = 1 << 12  # of a table of rows
 _MOST_PIXELS = 2**31 - 1  # of an image: the core numbers them with an int32
+_MARKS = 24  # words of a block, a bit for each edge
 _PLANES = ("tsdf", "weight", "color", "views", "label", "votes")  # in the order of the core's VoxelPlanes
 
 
@@ -106,14 +107,15 @@ def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid, *, min_weight: int, edg
     """Count the edges of every block that cross zero, then write their points where they belong."""
     count = len(blocks)
     planes, kept = plane_addresses(blocks)
-    field = (blocks.sorted_keys, blocks.sorted_rows, count, planes, min(min_weight - 1, MAX_WEIGHT))
+    field = (blocks.sorted_keys, blocks.sorted_rows, count, planes)
     counts, dropped = room(count, torch.int64), room(1, torch.int64)
-    call("pc_tsdf_count_crossings", *field, counts, dropped)
+    (marks,) = room_for(((count, _MARKS), torch.int64))
+    call("pc_tsdf_count_crossings", *field, min(min_weight - 1, MAX_WEIGHT), counts, marks, dropped)
     starts = ptr_from_counts(counts)
     found = _room_for_crossings(int(starts[-1]), int(dropped), blocks, edges)
     columns = (found.points, found.normals, found.weight, found.views, found.colors, found.labels)
     edge = found.edge if edges else None
-    call("pc_tsdf_write_crossings", *field, starts, grid.voxel_size, edge, *columns)
+    call("pc_tsdf_write_crossings", *field, marks, starts, grid.voxel_size, edge, *columns)
     del kept  # until here the addresses are good
     return found
 

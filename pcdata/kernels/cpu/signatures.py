@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0xC335062F522BD04
+INTERFACE_NUMBER = 0x3DA316CEB766CFC
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -146,9 +146,9 @@ pc_tsdf_pack_colors: uint8* colors, int64 count, int32* packed
 pc_tsdf_integrate: float* depth, int32* weight, int32* color, int32* label, int64 height, int64 width, double* pose,
     double block_size, float* steps, float* pinhole, float* lens, double scale, int64 carve, int64* rows, int64
     num_rows, int64* keys, int64* planes
-pc_tsdf_count_crossings: int64* keys, int64* rows, int64 count, int64* planes, int64 bound, int64* counts, int64*
-    dropped
-pc_tsdf_write_crossings: int64* keys, int64* rows, int64 count, int64* planes, int64 bound, int64* starts, double
+pc_tsdf_count_crossings: int64* keys, int64* rows, int64 count, int64* planes, int64 bound, int64* counts, int64* marks,
+    int64* dropped
+pc_tsdf_write_crossings: int64* keys, int64* rows, int64 count, int64* planes, int64* marks, int64* starts, double
     voxel_size, int64* edge, float* points, float* normals, float* weight, int64* views, float* colors, int64* labels
 pc_tsdf_index_mesh: int64* keys, int64* rows, int64 count, int64* planes, int64 bound, int64* edge, int64 num_edges,
     int64* signs, int64* edges

@@ -580,15 +580,16 @@ PC_EXPORT int32_t pc_tsdf_integrate(const pc_context* context, const float* dept
                                     int64_t num_rows, const int64_t* keys, const int64_t* const* planes);
 
 // Sorted block keys (count,) with their rows; planes as in pc_tsdf_integrate; what the weights of both ends must exceed
-// -> counts (count,): how many edges of each block cross zero; dropped (1,): how many more do, seen less.
+// -> counts (count,): how many edges of each block cross zero; marks (count, 24): which, 64 voxels of one z and an axis
+// in a word; dropped (1,): how many more do, seen less.
 PC_EXPORT int32_t pc_tsdf_count_crossings(const pc_context* context, const int64_t* keys, const int64_t* rows,
                                           int64_t count, const int64_t* const* planes, int64_t bound, int64_t* counts,
-                                          int64_t* dropped);
+                                          int64_t* marks, int64_t* dropped);
 
-// The same with starts (count + 1,): where each block's points go -> edge (M,) or null, points (M, 3), normals (M, 3),
-// weight (M,), views (M,), colors (M, 3) or null, labels (M,) or null.
+// The same blocks with their marks and starts (count + 1,): where each block's points go -> edge (M,) or null,
+// points (M, 3), normals (M, 3), weight (M,), views (M,), colors (M, 3) or null, labels (M,) or null.
 PC_EXPORT int32_t pc_tsdf_write_crossings(const pc_context* context, const int64_t* keys, const int64_t* rows,
-                                          int64_t count, const int64_t* const* planes, int64_t bound,
+                                          int64_t count, const int64_t* const* planes, const int64_t* marks,
                                           const int64_t* starts, double voxel_size, int64_t* edge, float* points,
                                           float* normals, float* weight, int64_t* views, float* colors,
                                           int64_t* labels);

@@ -385,5 +385,23 @@ inline uint64_t signs_of(const int8_t* numbers) {
   return bits;
 #endif
 }
+inline uint64_t signs_of(const int16_t* numbers) {
+#if defined(__AVX512BW__)
+  const uint64_t low = _mm512_movepi16_mask(_mm512_loadu_si512(numbers));
+  return low | static_cast<uint64_t>(_mm512_movepi16_mask(_mm512_loadu_si512(numbers + 32))) << 32;
+#elif defined(__SSE2__)
+  uint64_t bits = 0;
+  for (int i = 0; i < 4; ++i) {
+    const auto* const from = reinterpret_cast<const __m128i*>(numbers + 16 * i);
+    const __m128i some = _mm_packs_epi16(_mm_loadu_si128(from), _mm_loadu_si128(from + 1));
+    bits |= static_cast<uint64_t>(static_cast<uint32_t>(_mm_movemask_epi8(some))) << 16 * i;
+  }
+  return bits;
+#else
+  int8_t narrow[64];
+  for (int i = 0; i < 64; ++i) narrow[i] = static_cast<int8_t>(numbers[i] >> 8);
+  return signs_of(narrow);
+#endif
+}
 
 }  // namespace pc

@@ -25,7 +25,8 @@ void fetch(const Distances& block) {
   fetch(block.weight);
 }
 
-void count_all(const pc_context& context, const Field& field, int16_t bound, int64_t* counts, int64_t* dropped) {
+void count_all(const pc_context& context, const Field& field, int16_t bound, int64_t* counts, Marks* marks,
+               int64_t* dropped) {
   std::atomic<int64_t> all_dropped{0};
   parallel_for(context, field.blocks.count, kBlocksPerPiece, [&](int64_t begin, int64_t end, int64_t) {
     Column own(field.blocks, begin, 0, 0), right(field.blocks, begin, 1, 0), below(field.blocks, begin, 0, 1);
@@ -38,7 +39,8 @@ void count_all(const pc_context& context, const Field& field, int16_t bound, int
       below.look(field.blocks.keys[i], down);
       const Distances near[4] = {Distances::of(field, i), Distances::of(field, across[1]),
                                  Distances::of(field, down[1]), Distances::of(field, along[2])};
-      counts[i] = ends.marks(near[0], near[1], near[2], near[3], bound).count();
+      marks[i] = ends.marks(near[0], near[1], near[2], near[3], bound);
+      counts[i] = marks[i].count();
       if (bound > 0) lost += ends.marks(near[0], near[1], near[2], near[3], 0).count() - counts[i];
     }
     all_dropped.fetch_add(lost, std::memory_order_relaxed);
@@ -218,13 +220,12 @@ void write_block(const Field& field, int64_t number, const int64_t places[27], c
 
 // What a thread works in.
 struct Workspace {
-  EdgeEnds ends;
   BlockMargin near;
   Crossings found;
 };
 
-void write_all(const pc_context& context, const Field& field, int16_t bound, const int64_t* starts, double voxel_size,
-               const Points& out) {
+void write_all(const pc_context& context, const Field& field, const Marks* marks, const int64_t* starts,
+               double voxel_size, const Points& out) {
   std::vector<std::unique_ptr<Workspace>> workspaces(static_cast<size_t>(std::max(context.threads, 1)));
   parallel_for(context, field.blocks.count, kBlocksPerPiece, [&](int64_t begin, int64_t end, int64_t thread) {
     auto& own = workspaces[static_cast<size_t>(thread)];
@@ -251,11 +252,10 @@ void write_all(const pc_context& context, const Field& field, int16_t bound, con
         fetch(Distances::of(field, ahead[14]));
         if (out.colors != nullptr) fetch(field.planes.color.block(field.blocks.rows[ahead[13]]));
       }
-      const Marks marks = own->ends.marks(distances[13], distances[14], distances[16], distances[22], bound);
-      const LineRange lines = LineRange::of(marks);
+      const LineRange lines = LineRange::of(marks[i]);
       own->near.fill(distances, lines.wider(2, 2));
       own->near.find_slopes(lines);
-      own->found.list(marks);
+      own->found.list(marks[i]);
       write_block(field, i, places, own->near, voxel_size, own->found, out, starts[i]);
     }
   });
@@ -266,17 +266,17 @@ void write_all(const pc_context& context, const Field& field, int16_t bound, con
 
 PC_EXPORT int32_t pc_tsdf_count_crossings(const pc_context* context, const int64_t* keys, const int64_t* rows,
                                           int64_t count, const int64_t* const* planes, int64_t bound, int64_t* counts,
-                                          int64_t* dropped) {
+                                          int64_t* marks, int64_t* dropped) {
   using namespace pc;
   using namespace pc::tsdf;
   return guarded([&] {
     const Field field{{keys, rows, count}, VoxelPlanes(planes)};
-    count_all(*context, field, static_cast<int16_t>(bound), counts, dropped);
+    count_all(*context, field, static_cast<int16_t>(bound), counts, reinterpret_cast<Marks*>(marks), dropped);
   });
 }
 
 PC_EXPORT int32_t pc_tsdf_write_crossings(const pc_context* context, const int64_t* keys, const int64_t* rows,
-                                          int64_t count, const int64_t* const* planes, int64_t bound,
+                                          int64_t count, const int64_t* const* planes, const int64_t* marks,
                                           const int64_t* starts, double voxel_size, int64_t* edge, float* points,
                                           float* normals, float* weight, int64_t* views, float* colors,
                                           int64_t* labels) {
@@ -284,7 +284,7 @@ PC_EXPORT int32_t pc_tsdf_write_crossings(const pc_context* context, const int64
   using namespace pc::tsdf;
   return guarded([&] {
     const Field field{{keys, rows, count}, VoxelPlanes(planes)};
-    write_all(*context, field, static_cast<int16_t>(bound), starts, voxel_size,
+    write_all(*context, field, reinterpret_cast<const Marks*>(marks), starts, voxel_size,
               {edge, points, normals, weight, views, colors, labels});
   });
 }

@@ -32,10 +32,11 @@ struct Distances {
     const auto seen = static_cast<int16_t>(-static_cast<int16_t>(weight[voxel] > bound));
     return static_cast<int16_t>((tsdf[voxel] & seen) | (kUnseen & ~seen));
   }
-  void copy_line(int voxel, int16_t* to, int16_t bound) const {
+  Line line(int voxel, int16_t bound) const {
     const auto seen = load<Line>(weight + voxel) > bound;
-    store(to, (load<Line>(tsdf + voxel) & seen) | (kUnseen & ~seen));
+    return (load<Line>(tsdf + voxel) & seen) | (kUnseen & ~seen);
   }
+  void copy_line(int voxel, int16_t* to, int16_t bound) const { store(to, line(voxel, bound)); }
 };
 
 // -- which edges cross zero ---------------------------------------------------------------------------------------
@@ -81,11 +82,11 @@ class EdgeEnds {
 
   // Apart in sign, by at most 32767: 16 bits hold the difference. An unseen end is too far from one of the other sign.
   static uint64_t crossing(const int16_t* here, const int16_t* there) {
-    int8_t crosses[kSlab];
+    int16_t crosses[kSlab];  // below zero where it does
     for (int i = 0; i < kSlab; ++i) {
       const int16_t low = std::min(here[i], there[i]), high = std::max(here[i], there[i]);
       const auto apart = static_cast<int16_t>(high - low);
-      crosses[i] = static_cast<int8_t>((low & ~high & ~apart) >> 15);
+      crosses[i] = static_cast<int16_t>(low & ~high & ~apart);
     }
     return signs_of(crosses);
   }
@@ -130,15 +131,19 @@ class BlockMargin {
  public:
   void fill(const Distances near[27], const LineRange& lines) {
     for (int z = lines.z0; z <= lines.z1; ++z)
-      for (int y = lines.y0; y <= lines.y1; ++y) {
-        const Distances* three = near + 13 + 3 * (y >> 3) + 9 * (z >> 3);
-        const int line = (z & 7) * kSlab + (y & 7) * kEdge;
-        int16_t* to = value_ + kBefore + place_of(0, y, z);
-        // In this order: what runs over the end of a line is overwritten by the next.
-        to[-2] = three[-1].at(line + kEdge - 2, 0);
-        to[-1] = three[-1].at(line + kEdge - 1, 0);
-        three[0].copy_line(line, to, 0);
-        three[1].copy_line(line, to + kEdge, 0);
+      for (int row = -1; row <= 1; ++row) {  // of blocks
+        const int begin = std::max(lines.y0, kEdge * row), end = std::min(lines.y1, kEdge * row + kEdge - 1);
+        const Distances* const three = near + 13 + 3 * row + 9 * (z >> 3);
+        const Distances left = three[-1], middle = three[0], right = three[1];
+        for (int y = begin; y <= end; ++y) {
+          const int line = (z & 7) * kSlab + (y & 7) * kEdge;
+          int16_t* const to = value_ + kBefore + place_of(0, y, z);
+          // In this order: what runs over the end of a line is overwritten by the next.
+          const auto before = left.line(line, 0);
+          std::memcpy(to - 2, reinterpret_cast<const char*>(&before) + sizeof before - 4, 4);
+          middle.copy_line(line, to, 0);
+          right.copy_line(line, to + kEdge, 0);
+        }
       }
   }
 
