@@ -13,6 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.contracts.compiling import is_traced
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.host import all_finite
 from pcdata.contracts.known import FINITE, is_known
@@ -101,12 +102,18 @@ def orient_normals(
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
     """
     _check_viewpoint(points, normals, viewpoint)
-    return facing_normals(points, normals, viewpoint)
+    turned = _turned if is_traced() else facing_normals  # a compiler knows what to do with the plain one
+    return turned(points, normals, viewpoint)
 
 
 @inner
 def facing_normals(points: Tensor, normals: Tensor, viewpoint: Tensor) -> Tensor:
-    """Run the body of :func:`orient_normals`; the product is (x + y) + z."""
+    """Run the body of :func:`orient_normals`."""
+    return _turned(points, normals, viewpoint)
+
+
+def _turned(points: Tensor, normals: Tensor, viewpoint: Tensor) -> Tensor:
+    """Turn normals that face away; the product is (x + y) + z."""
     x, y, z = (normals.double() * (viewpoint.double() - points.double())).unbind(-1)
     return torch.where(((x + y) + z < 0)[:, None], -normals, normals)
 

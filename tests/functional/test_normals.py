@@ -119,6 +119,12 @@ def test_kernels_turn_what_the_reference_turns(count: int):
     assert asked.grad is not None
 
 
+def test_a_compiler_traces_the_plain_body():
+    points, normals = torch.randn((2, 20, 3), generator=torch.Generator().manual_seed(3))
+    compiled = torch.compile(lambda *given: orient_normals(*given, torch.zeros(3)), backend="eager")
+    assert torch.equal(compiled(points, normals), orient_normals(points, normals, torch.zeros(3)))
+
+
 @pytest.mark.parametrize("backend", ["auto", "torch"])
 def test_without_a_radius_the_nearest_count_however_far(backend: str):
     corners = torch.cartesian_prod(*[torch.tensor([0.0, 1.0])] * 3)  # of a unit cube, each with its three neighbors
