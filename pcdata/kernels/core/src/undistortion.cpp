@@ -182,10 +182,12 @@ struct Sampling {
   void nearest(Block& block, int count, int64_t first, int64_t view) const {
     block.find_nearest();
     const Value* own = image + view * per_view();
-    Value* to = sampled + first * channels;
-    for (int i = 0; i < count; ++i, to += channels) {
-      const Value* from = own + block.pixel(i) * channels;
-      for (int64_t channel = 0; channel < channels; ++channel) to[channel] = block.valid[i] ? from[channel] : Value{0};
+    const int64_t some = channels;  // not read again after each byte, which may lie anywhere
+    Value* to = sampled + first * some;
+    for (int i = 0; i < count; ++i, to += some) {
+      const Value* from = own + block.pixel(i) * some;
+      const bool is_valid = block.valid[i] != 0;
+      for (int64_t channel = 0; channel < some; ++channel) to[channel] = is_valid ? from[channel] : Value{0};
     }
   }
 
@@ -212,11 +214,12 @@ struct Sampling {
   void by_bytes(const Block& block, int count, int64_t first, int64_t view) const {
     const Value* own = image + view * per_view();
     const int64_t last = (views - view) * per_view() - 4 - around.step[3] * kChannels;
+    const Around own_around = around;  // not read again after each byte, which may lie anywhere
     Value* to = sampled + first * kChannels;
     for (int i = 0; i < count; ++i, to += kChannels) {
       const int64_t at = block.pixel(i) * kChannels;
       if (block.valid[i] && at <= last && (kChannels == 4 || i + 1 < count))
-        mix_bytes<kChannels>(own + at, around, block, i, to);
+        mix_bytes<kChannels>(own + at, own_around, block, i, to);
       else
         one(own, block, i, to);
     }
@@ -229,7 +232,8 @@ void sample_image(const pc_context& context, const Sampling<Value>& sampling, co
   parallel_for(context, sampling.views * out_pixels, kPixelsPerPiece, [&](int64_t begin, int64_t end, int64_t) {
     for_blocks(places, begin, end, out_pixels, sampling.size,
                [&](Block& block, int count, int64_t first, int64_t view) {
-                 for (int i = 0; i < count; ++i) valid[first + i] = static_cast<uint8_t>(block.valid[i]);
+                 uint8_t* const to = valid + first;  // not read again after each byte, which may lie anywhere
+                 for (int i = 0; i < count; ++i) to[i] = static_cast<uint8_t>(block.valid[i]);
                  if (nearest)
                    sampling.nearest(block, count, first, view);
                  else
