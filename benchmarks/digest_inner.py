@@ -142,6 +142,8 @@ def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
             f"{lens} without flying pixels",
             partial(_into_box, lens, moved=True, flying=(0.01, 3)),
         )
+    some = torch.arange(400) % 5 > 0
+    yield "radius_outliers_within", "one", lambda: ((points(400, 3), ptr_of(400), some, 4, 0.03, None), {})
     yield "nearest_chunks", "radius", lambda: ((points(400, 3), ptr_of(400), 6), {"radius": 0.03})
     asked = _queries({})
     searched = asked.pop("points"), asked.pop("ptr"), 5

@@ -6,16 +6,18 @@ cases were found by experiment; Rusu et al., Toward 3D point cloud based object 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-from pcdata.contracts.dispatch import op
+from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_length, checked_positive
 from pcdata.contracts.operators import Traced
 from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.nearest import nearest_chunks, pair_chunks, rooted
 from pcdata.functional.radius import require_extent, squared_radius
-from pcdata.functional.rows import cloud_of_rows, counts_from_ptr
+from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask
 
 # Interleaved sums: as many as threads of a GPU that work together.
 _RUNS = 1024
@@ -139,4 +141,22 @@ def radius_outlier_mask(
     outlier = torch.empty(len(points), dtype=torch.bool, device=points.device)
     for pairs in pair_chunks(points, ptr, points, ptr):
         outlier[pairs.query] = (pairs.squared < limit).sum(1) <= min_neighbors
+    return outlier
+
+
+@inner
+def radius_outliers_within(
+    points: Tensor,  # (N, 3) float32, all finite
+    ptr: Tensor,  # (B+1,)
+    within: Tensor,  # (N,) bool
+    min_neighbors: int,
+    radius: float,
+    grid: ImageGrid | None,
+) -> Tensor:  # (N,) bool
+    """Mark outliers as :func:`radius_outlier_mask` does, where the points ``within`` are all that there are."""
+    left = None if grid is None else replace(grid, pixel_index=grid.pixel_index[within])
+    outlier = torch.zeros_like(within)
+    outlier[within] = radius_outlier_mask(
+        points[within], ptr_after_mask(within, ptr), min_neighbors=min_neighbors, radius=radius, grid=left
+    )
     return outlier

@@ -25,7 +25,14 @@ from pcdata.transforms.decisions import Decision, Decisions, Entry, in_a_row
 from pcdata.transforms.field_checks import validated_fields
 from pcdata.transforms.fused_beginning import find_beginning, run_beginning
 from pcdata.transforms.fused_motions import motions_from, read_by_motions, run_motions
-from pcdata.transforms.fused_selections import SetAside, are_many, looked_at, run_selections, selections_from
+from pcdata.transforms.fused_selections import (
+    SetAside,
+    are_many,
+    looked_at,
+    pick_together,
+    run_selections,
+    selections_from,
+)
 from pcdata.yaml_nodes import Document, YamlDocument, yaml_text
 
 
@@ -352,8 +359,11 @@ def _selected(steps: Sequence[Transform], positions: range, cloud: PointCloud, t
     """Run selections together; None where there are not two, or they must be run one by one."""
     if len(positions) < 2:
         return None
-    parts = SetAside.of_cloud(cloud, looked_at(steps[positions.start : positions.stop]))
-    return None if parts is None else run_selections(steps, positions, parts[1], parts[0], told)
+    together = steps[positions.start : positions.stop]
+    parts = SetAside.of_cloud(cloud, looked_at(together))
+    if parts is not None:
+        return run_selections(steps, positions, parts[1], parts[0], told)
+    return run_selections(steps, positions, cloud, None, told) if pick_together(together) else None
 
 
 def _step(step: Transform, data: Data, generator: GeneratorLike | None) -> tuple[Data, GeneratorLike | None]:

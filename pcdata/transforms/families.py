@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Collection
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -44,6 +44,12 @@ class SpatialTransform(Transform, abstract=True):
 
 class SelectTransform(Transform, abstract=True):
     """A step that keeps some rows, possibly repeated or reordered within their cloud: write ``pick``."""
+
+    decides_within: ClassVar[bool] = False  # also among some of the rows of a cloud, as they lie: params_within
+
+    def params_within(self, data: PointCloud, within: Tensor) -> Params:
+        """Decide what stays of the rows that a (N,) bool mask has, as if they were all; ``index`` is of all rows."""
+        raise NotImplementedError(f"{type(self).__name__}: write the method params_within(self, data, within)")
 
     def looks_at(self) -> Collection[str] | None:
         """The per-point fields that picking looks at, ``source_index`` for the image; None = it may look at any."""
@@ -109,9 +115,12 @@ class DropLimit(Transform, abstract=True):
             warnings.warn(text, LeftOutWarning, stacklevel=2)
 
 
-def kept_params(marks: Tensor, ptr: Tensor, *, gone: bool = False) -> Params:
-    """Return the params of a selection that keeps the rows that are marked, or with ``gone`` those that are not."""
-    keep, kept_ptr, sums = kept_rows(marks, ptr, gone=gone)
+def kept_params(marks: Tensor, ptr: Tensor, *, gone: bool = False, within: Tensor | None = None) -> Params:
+    """Return the params of a selection that keeps the rows that are marked, or with ``gone`` those that are not.
+
+    Of the rows ``within`` alone, if that is given.
+    """
+    keep, kept_ptr, sums = kept_rows(marks, ptr, gone=gone, within=within)
     params = {"index": keep, "ptr": kept_ptr}
     return params if sums is None else {**params, TOLD_ROWS: sums}
 

@@ -2,8 +2,9 @@
 
 Each step by itself would copy every field of the rows that it leaves, for the next to copy most of them again.
 :class:`Compose` therefore sets fields aside that no step of the run looks at: colors, normals, labels. They come back
-for the rows that are left, from where they lay; right behind a deprojection that is the images themselves. The clouds
-and their histories are those of the single steps, bit for bit; and whatever they would refuse is left to them.
+for the rows that are left, from where they lay; right behind a deprojection that is the images themselves. And where a
+step can decide among the rows that the one before it keeps, as they lie, rows are picked once for both. The clouds and
+their histories are those of the single steps, bit for bit; and whatever they would refuse is left to them.
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pcdata.contracts.known import FINITE, is_known
+from pcdata.contracts.on_host import counts_of
 from pcdata.errors import PcdataError
 from pcdata.functional.rows import pick_rows
 from pcdata.structures import Kind, PointCloud
 from pcdata.structures.kinds import attributes
 from pcdata.structures.structure import derived
-from pcdata.transforms.base import Transform
+from pcdata.transforms.base import Params, Transform
 from pcdata.transforms.families import SelectTransform
 
 _MIN_ROWS = 1 << 15
@@ -54,6 +57,11 @@ def looked_at(steps: Sequence[Transform]) -> set[str]:
         assert isinstance(step, SelectTransform)
         found.update(step.looks_at() or ())
     return found
+
+
+def pick_together(steps: Sequence[Transform]) -> bool:
+    """Say whether a step behind the first may decide among the rows that the one before it keeps."""
+    return any(isinstance(step, SelectTransform) and step.decides_within for step in steps[1:])
 
 
 @dataclass(frozen=True)
@@ -100,17 +108,48 @@ def run_selections(
     steps: Sequence[Transform],
     positions: range,
     cloud: PointCloud,
-    aside: SetAside,
+    aside: SetAside | None,
     told: Callable[[range, PointCloud], None],
 ) -> PointCloud | None:
     """Run the steps at some positions, which :func:`selections_from` found; None where one refuses.
 
-    ``told`` is called behind each with what it left, without the fields that are set aside.
+    ``told`` is called behind each that picks rows, with the positions of those that this is for and with what they
+    left, without the fields that are set aside.
     """
+    chosen: Params | None = None  # decided, and not picked yet
+    start = positions.start
     try:
         for position in positions:
-            cloud = steps[position](cloud)
-            told(range(position, position + 1), cloud)
+            behind = steps[position + 1] if position + 1 < positions.stop else None
+            cloud, chosen = _run(steps[position], cloud, chosen, behind)
+            if chosen is None:
+                told(range(start, position + 1), cloud)
+                start = position + 1
     except (PcdataError, Warning):  # a warning may be an error to the caller
         return None  # the step that refuses says why
-    return aside.back(cloud)
+    return cloud if aside is None else aside.back(cloud)
+
+
+def _run(
+    step: Transform, cloud: PointCloud, chosen: Params | None, behind: Transform | None
+) -> tuple[PointCloud, Params | None]:
+    """Run one step; return also what is chosen of the cloud, where the step behind it takes that as it lies."""
+    may_wait = isinstance(behind, SelectTransform) and behind.decides_within and cloud.device.type == "cpu"
+    if chosen is None and not (may_wait and type(step).transform is SelectTransform.transform):
+        return step(cloud), None
+    assert isinstance(step, SelectTransform)
+    step.check_input(cloud)
+    if chosen is None:
+        before, params = counts_of(cloud.ptr), step.make_params(cloud, step.no_streams)
+    else:
+        before, params = counts_of(chosen["ptr"]), step.params_within(cloud, chosen["index"])
+    after = counts_of(params["ptr"])
+    cloud = step.recorded_counts(cloud, before, after, params, rows=step.told_rows(cloud, params))
+    if may_wait and _is_most(params["index"], sum(after)) and is_known(FINITE, cloud.points):
+        return cloud, params
+    return step.transform(cloud, params), None
+
+
+def _is_most(index: Tensor, count: int) -> bool:
+    """Say whether it is a mask, and has so many rows that it does not cost much to pass over the others."""
+    return index.dtype is torch.bool and 2 * count >= len(index)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import roomy_body
 from pcdata.functional.fixed_rows import FixedRows
-from pcdata.functional.outliers import radius_outlier_mask, statistical_outlier_mask
+from pcdata.functional.outliers import radius_outlier_mask, radius_outliers_within, statistical_outlier_mask
 from pcdata.rng import Streams
 from pcdata.sensors import SensorProfile
 from pcdata.structures import PointCloud
@@ -53,6 +53,7 @@ class RemoveRadiusOutliers(RemoveTransform):
     """Drop points with no more than ``min_neighbors`` points, themselves included, within a radius (Open3D's rule)."""
 
     runs_statistics = True
+    decides_within = True
 
     min_neighbors: Count = 5
     radius: Annotated[Metres, FromSensor(SensorProfile.outlier_radius)] = 0.01
@@ -67,6 +68,12 @@ class RemoveRadiusOutliers(RemoveTransform):
             data.points, data.ptr, min_neighbors=self.min_neighbors, radius=self.radius, grid=data.image_grid()
         )
         return kept_params(outlier, data.ptr, gone=True)
+
+    def params_within(self, data: PointCloud, within: Tensor) -> Params:
+        """Keep the rows with company among some."""
+        fields = self.min_neighbors, self.radius, data.image_grid()
+        outlier = radius_outliers_within(data.points, data.ptr, within, *fields)
+        return kept_params(outlier, data.ptr, gone=True, within=within)
 
     def fixed_keep(self, like: FixedRows) -> Callable[[FixedRows], Tensor] | None:
         """Mark the rows with company."""

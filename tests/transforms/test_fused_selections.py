@@ -12,7 +12,7 @@ import torch
 
 from pcdata.contracts.dispatch import why_unavailable
 from pcdata.errors import ConfigError
-from pcdata.functional.rows import ptr_after_mask
+from pcdata.functional.rows import pick_rows, ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import DepthFrame, Kind, PointCloud
 from pcdata.synthetic import tabletop
@@ -72,6 +72,18 @@ CHAINS: dict[str, list[Any]] = {
         CropWorkspace(frame="base", lower=(-0.3, -0.3, -0.1), upper=(0.3, 0.3, 0.5)),
         RemovePlane(num_hypotheses=50, keep="above", cut="measured", up=(0, 0, 1), frame="base"),
         RemoveRadiusOutliers(min_neighbors=2, radius=0.05),
+    ],
+    "twice by radius": [
+        Deproject(),
+        CROP,
+        RemoveDuplicates(),
+        *[RemoveRadiusOutliers(radius=0.06, min_neighbors=3)] * 3,
+    ],
+    "few, then by radius": [
+        Deproject(),
+        CROP,
+        CropPolygon(frame="camera", polygon=((-0.1, -0.1), (0.1, -0.1), (0.1, 0.1))),
+        RemoveRadiusOutliers(radius=0.06, min_neighbors=3),
     ],
     "by labels": [Deproject(), CROP, KeepValues(values=(0, 1, 2)), RemoveRadiusOutliers(min_neighbors=2, radius=0.05)],
     "by confidence": [Deproject(), CROP, KeepValues(field="confidence", low=2), DropNonFinite(fields=("confidence",))],
@@ -164,7 +176,13 @@ def whole_cloud() -> PointCloud:
 
 
 @pytest.mark.usefixtures("bodies")
-@pytest.mark.parametrize("chain", ["usual", "by labels", "by confidence", "by color", "balanced", "short", "zeros"])
+@pytest.mark.parametrize(
+    "chain",
+    [
+        *("usual", "by labels", "by confidence", "by color", "balanced", "short", "zeros"),
+        *("twice by radius", "few, then by radius"),
+    ],
+)
 def test_clouds_come_to_what_the_steps_give(chain, together):
     steps = Compose([step for step in CHAINS[chain] if isinstance(step, SelectTransform)])
     cloud = whole_cloud()
@@ -176,15 +194,58 @@ def test_clouds_come_to_what_the_steps_give(chain, together):
     assert_same(cloud, whole_cloud())
 
 
-def test_the_usual_steps_run_together_and_are_told_one_by_one(together):
+@pytest.fixture
+def picked(monkeypatch) -> list[int]:
+    """How many rows of a mask each picking of rows copied."""
+    found: list[int] = []
+
+    def noted(fields, rows, **options):
+        result = pick_rows(fields, rows, **options)
+        if rows.dtype is torch.bool:
+            found.append(len(result["points"]))
+        return result
+
+    monkeypatch.setattr("pcdata.structures.point_cloud.pick_rows", noted)
+    return found
+
+
+@pytest.mark.parametrize("fields", [("colors", "labels"), ()])
+@pytest.mark.skipif(why_unavailable("cpu") is not None, reason="its reference picks the rows")
+def test_rows_are_picked_once_where_the_next_step_decides_among_them(fields, picked):
+    cloud = whole_cloud()
+    cloud = cloud.with_fields(**dict.fromkeys({*cloud.fields()} - {"points", "source_index", *fields}))
+    both, few = CHAINS["twice by radius"][2:], CHAINS["few, then by radius"][2:]
+    result = Compose(both)(cloud)
+    assert picked == [result.num_points]
+    assert [step["points"] for step in result.history[0][-4:]] == sorted(
+        (step["points"] for step in result.history[0][-4:]), reverse=True
+    )
+    picked.clear()
+    result = Compose(few)(cloud)
+    assert picked[1:] == [result.num_points]
+    assert 0 < picked[0] < cloud.num_points / 2
+
+
+@pytest.mark.usefixtures("bodies")
+@pytest.mark.parametrize("value", [torch.nan, torch.inf])
+def test_points_that_are_no_numbers_are_refused_by_the_step_that_cannot_take_them(value, together):
+    cloud = whole_cloud()
+    spoilt = dataclasses.replace(cloud, points=cloud.points.index_fill(0, torch.tensor([3]), value), layout=None)
+    chain = Compose([KeepValues(values=(0, 1, 2, -1)), RemoveRadiusOutliers(min_neighbors=2, radius=0.05)])
+    assert said_by(lambda: run(chain, spoilt)) == said_by(lambda: step_by_step(chain, spoilt))
+    chain = Compose([DropNonFinite(), *chain.steps])
+    assert_same(run(chain, spoilt), step_by_step(chain, spoilt))
+
+
+def test_the_usual_steps_run_together_and_are_told_pass_by_pass(together):
     told = []
     chain = Compose(CHAINS["usual"])
     chain.run_in_passes(FULL, after=lambda steps, cloud: told.append((steps, cloud.num_points, sorted(cloud.fields()))))
     assert together == [[type(step).__name__ for step in CHAINS["usual"][3:]]]
     lean = ["points", "source_index"]
     history = step_by_step(chain, FULL).history
-    points = [sum(of_cloud[-6 + step]["points"] for of_cloud in history) for step in range(1, 6)]
-    positions = [range(3), *[range(number, number + 1) for number in range(3, 7)]]
+    points = [sum(of_cloud[-6 + step]["points"] for of_cloud in history) for step in (1, 3, 4, 5)]
+    positions = [range(3), range(3, 5), range(5, 6), range(6, 7)]
     assert told == [(steps, count, lean) for steps, count in zip(positions, points, strict=True)]
 
 
@@ -192,6 +253,12 @@ def refusals() -> dict[str, list[Any]]:
     far = CropPolygon(frame="camera", polygon=((5, 5), (6, 5), (6, 6)))
     return {
         "nothing left": [Deproject(), CROP, RemoveDuplicates(), far, *USUAL],
+        "nothing has company": [Deproject(), CROP, RemoveDuplicates(), RemoveRadiusOutliers(radius=1e-5)],
+        "too small a radius": [Deproject(), CROP, RemoveDuplicates(), RemoveRadiusOutliers(radius=1e-13)],
+        "too many without company": [
+            *(Deproject(), CROP, RemoveDuplicates()),
+            RemoveRadiusOutliers(radius=0.05, min_neighbors=8, max_drop=1e-6),
+        ],
         "too few": [Deproject(), CROP, RemoveDuplicates(), FarthestPointSample(num_points=10**6)],
         "a limit": [Deproject(), CROP, RemovePlane(num_hypotheses=20, max_drop=0.01), RemoveDuplicates()],
         "another frame": [
@@ -210,7 +277,13 @@ def said_by(call: Callable[[], Any]) -> list[str]:
 
 
 @pytest.mark.usefixtures("bodies")
-@pytest.mark.parametrize("case", ["nothing left", "too few", "a limit"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        *("nothing left", "too few", "a limit"),
+        *("nothing has company", "too small a radius", "too many without company"),
+    ],
+)
 @pytest.mark.parametrize("given", ["capture", "cloud"])
 def test_the_step_that_refuses_says_so_itself(case, given, together):
     steps = refusals()[case]

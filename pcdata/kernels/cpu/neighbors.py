@@ -19,7 +19,7 @@ import pcdata.functional.neighborhoods
 import pcdata.functional.normals
 import pcdata.functional.outliers  # noqa: F401
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
-from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.metrics import mean_per_cloud
 from pcdata.functional.neighbors import Listed, cut_to_radii, grown_within, widest
 from pcdata.functional.norms import NORMS
@@ -363,19 +363,30 @@ def radius_outlier_mask(
     points: Tensor, ptr: Tensor, min_neighbors: int, radius: float, grid: ImageGrid | None
 ) -> Tensor:
     """Search the points stored before and after each one, then the cells around those that are left."""
+    return _radius_outliers(points, ptr, None, min_neighbors, radius, grid)
+
+
+@kernel("radius_outliers_within", "cpu")
+def radius_outliers_within(
+    points: Tensor, ptr: Tensor, within: Tensor, min_neighbors: int, radius: float, grid: ImageGrid | None
+) -> Tensor:
+    """Do so, and pass over what is no point."""
+    if grid is not None:
+        grid = checked_grid("radius_outlier_mask", "grid", {"grid": grid, "points": points, "ptr": ptr})
+    return _radius_outliers(points, ptr, within.contiguous(), min_neighbors, radius, grid)
+
+
+def _radius_outliers(
+    points: Tensor, ptr: Tensor, within: Tensor | None, min_neighbors: int, radius: float, grid: ImageGrid | None
+) -> Tensor:
+    points, ptr = _rows(points, ptr)
     outlier = room(len(points), torch.bool)
     largest = room(1, torch.float64)
     enough = min(min_neighbors, len(points))  # as unreachable as any larger number, and fits an int64
     call(
         "pc_radius_outlier_mask",
-        points,
-        ptr,
-        len(ptr) - 1,
-        radius,
-        enough,
-        *_grid_arguments(grid)[:2],
-        outlier,
-        largest,
+        *(points, ptr, len(ptr) - 1, radius, enough),
+        *(*_grid_arguments(grid)[:2], within, outlier, largest),
     )
     require_cells("radius_outlier_mask", radius, largest.item())
     return outlier

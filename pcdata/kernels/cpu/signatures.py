@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x3DA316CEB766CFC
+INTERFACE_NUMBER = 0xE1EDD5EDC4AEDBD
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -109,7 +109,7 @@ pc_face_normals: float* points, float* normals, int64 count, float* viewpoint, i
 pc_statistical_outliers: float* points, int64* ptr, int64 num_clouds, int64 num_neighbors, double std_ratio, int64*
     pixel, int64 width, double* camera, double* mean, bool* outlier
 pc_radius_outlier_mask: float* points, int64* ptr, int64 clouds, double radius, int64 min_neighbors, int64* pixel, int64
-    width, uint8* outlier, double* largest
+    width, uint8* within, uint8* outlier, double* largest
 pc_dbscan: float* points, int64* ptr, int64 clouds, double eps, int64 min_points, int64* labels, double* largest
 pc_farthest_points: float* points, int64* ptr, int64 num_clouds, int64* wanted, int64* picks
 pc_wide_farthest_points: float* points, int64* ptr, int64 num_clouds, int64 width, int64* wanted, int64* picks

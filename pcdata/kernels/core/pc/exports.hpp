@@ -431,11 +431,12 @@ PC_EXPORT int32_t pc_statistical_outliers(const pc_context* context, const float
 
 // -- radius outliers and clusters -------------------------------------------------------------------------------------
 
-// pixel (N,) rising within each cloud, or null; outlier (N,) out; largest (1,) out: the largest cell coordinate of any
-// cloud. The mask is complete only if that is below 2^36.
+// pixel (N,) rising within each cloud, or null; within (N,) are the points that there are, null = all: the others are
+// no outliers; outlier (N,) out; largest (1,) out: the largest cell coordinate of any cloud. The mask is complete only
+// if that is below 2^36.
 PC_EXPORT int32_t pc_radius_outlier_mask(const pc_context* context, const float* points, const int64_t* ptr,
                                          int64_t clouds, double radius, int64_t min_neighbors, const int64_t* pixel,
-                                         int64_t width, uint8_t* outlier, double* largest);
+                                         int64_t width, const uint8_t* within, uint8_t* outlier, double* largest);
 
 // labels (N,) out; largest (1,) out: the largest cell coordinate of any cloud. The labels
 // are complete only if that is below 2^36.

@@ -20,11 +20,14 @@ namespace {
 struct RadiusSearch {
   const float* points;  // (count, 3) one cloud
   int64_t count;
-  float radius, limit;   // a neighbor has d2 < limit
-  int64_t enough;        // neighbors that make an inlier, itself included
-  uint8_t* outlier;      // (count,) 1 = not yet shown to be an inlier
-  const int64_t* pixel;  // (count,) where each point lies in an image, rising; null = unknown
-  int64_t width;         // of the image
+  float radius, limit;    // a neighbor has d2 < limit
+  int64_t enough;         // neighbors that make an inlier, itself included
+  uint8_t* outlier;       // (count,) 1 = not yet shown to be an inlier
+  const int64_t* pixel;   // (count,) where each point lies in an image, rising; null = unknown
+  int64_t width;          // of the image
+  const uint8_t* within;  // (count,) the points that there are; null = all
+
+  bool has(int64_t i) const { return within == nullptr || within[i] != 0; }
 };
 
 // Coordinates of the points around a piece of a cloud, infinitely far away (so never near) outside the cloud.
@@ -34,7 +37,8 @@ struct Window {
   static constexpr int kSize = kPiece + 2 * kMostAround;
   alignas(64) float x[kSize], y[kSize], z[kSize];
 
-  void load(const float* points, int64_t count, int64_t first) {  // slot 0 is point `first`, which may be negative
+  void load(const RadiusSearch& search, int64_t first) {  // slot 0 is point `first`, which may be negative
+    const int64_t count = search.count;
     const int begin = static_cast<int>(std::clamp<int64_t>(-first, 0, kSize));
     const int end = static_cast<int>(std::clamp<int64_t>(count - first, 0, kSize));
     const auto clear = [&](int from, int to) {
@@ -43,11 +47,13 @@ struct Window {
     clear(0, begin);
     clear(end, kSize);
     for (int i = begin; i < end; ++i) {
-      const float* point = points + 3 * (first + i);
+      const float* point = search.points + 3 * (first + i);
       x[i] = point[0];
       y[i] = point[1];
       z[i] = point[2];
     }
+    if (search.within == nullptr) return;
+    for (int i = begin; i < end; ++i) x[i] = search.within[first + i] ? x[i] : std::numeric_limits<float>::infinity();
   }
   bool near(int a, int b, float limit) const {
     return math::squared_distance(x[a], y[a], z[a], x[b], y[b], z[b]) < limit;
@@ -92,7 +98,7 @@ bool enough_in_rows(const RadiusSearch& search, PixelSearch* seekers, int64_t i)
     for (int64_t other = seekers[r].seek(first, i);
          other < search.count && search.pixel[other] <= first + 2 * kColumnsAround; ++other) {
       const float* p = search.points + 3 * other;
-      found += math::squared_distance(p[0], p[1], p[2], q[0], q[1], q[2]) < search.limit;
+      found += math::squared_distance(p[0], p[1], p[2], q[0], q[1], q[2]) < search.limit && search.has(other);
     }
     if (found >= search.enough) return true;
   }
@@ -103,7 +109,7 @@ bool enough_in_rows(const RadiusSearch& search, PixelSearch* seekers, int64_t i)
 // then in the image rows around them. Returns how many points of [begin, end) stay marked.
 int64_t search_sequence(const RadiusSearch& search, int64_t begin, int64_t end, int close, int wide) {
   Window window;
-  window.load(search.points, search.count, begin - kMostAround);
+  window.load(search, begin - kMostAround);
   const int count = static_cast<int>(end - begin);
   const float limit = search.limit;
   uint8_t* outlier = search.outlier + begin;
@@ -115,7 +121,7 @@ int64_t search_sequence(const RadiusSearch& search, int64_t begin, int64_t end, 
       near[i] += window.near(slot, slot - step, limit) + window.near(slot, slot + step, limit);
     }
   int64_t left = 0;
-  for (int i = 0; i < count; ++i) left += outlier[i] = near[i] < search.enough;
+  for (int i = 0; i < count; ++i) left += outlier[i] = near[i] < search.enough && search.has(begin + i);
   // A piece whose points have few neighbors so close by in memory is in no order, and a wider look would be wasted.
   if (2 * left > count) return left;
   const bool has_rows = search.pixel != nullptr && search.width >= kNarrowest;
@@ -167,7 +173,7 @@ Pick pick_around_marked(const pc_context& context, ScratchFrame& scratch, const 
   });
   uint32_t* rows = scratch.take<uint32_t>(search.count);
   parallel_for(context, num_pieces, 1, [&](int64_t p, int64_t, int64_t) {
-    pieces[p].end = pieces[p].begin + blocks.pick(search.points, pieces[p], rows + pieces[p].begin);
+    pieces[p].end = pieces[p].begin + blocks.pick(search.points, search.within, pieces[p], rows + pieces[p].begin);
   });
   int64_t count = 0;
   for (const Range& piece : pieces) {
@@ -184,7 +190,18 @@ Pick pick_some_and_marked(ScratchFrame& scratch, const RadiusSearch& search) {
   int64_t count = 0;
   for (int64_t i = 0; i < search.count; ++i) {
     rows[count] = static_cast<uint32_t>(i);
-    count += (i % kEvery < kRun) | search.outlier[i];
+    count += ((i % kEvery < kRun) | search.outlier[i]) & search.has(i);
+  }
+  return {rows, count};
+}
+
+Pick pick_all(ScratchFrame& scratch, const RadiusSearch& search) {
+  if (search.within == nullptr) return {nullptr, search.count};
+  uint32_t* rows = scratch.take<uint32_t>(search.count);
+  int64_t count = 0;
+  for (int64_t i = 0; i < search.count; ++i) {
+    rows[count] = static_cast<uint32_t>(i);
+    count += search.has(i);
   }
   return {rows, count};
 }
@@ -208,8 +225,9 @@ int64_t mark_by_sequence(const pc_context& context, const RadiusSearch& search) 
     }
   }
   if (!in_order) {
-    std::fill(search.outlier, search.outlier + search.count, uint8_t{1});
-    return search.count;
+    int64_t all = 0;
+    for (int64_t i = 0; i < search.count; ++i) all += search.outlier[i] = search.has(i);
+    return all;
   }
   std::atomic<int64_t> marked{0};
   parallel_for(context, search.count, kPiece, [&](int64_t begin, int64_t end, int64_t) { marked += mark(begin, end); });
@@ -219,9 +237,16 @@ int64_t mark_by_sequence(const pc_context& context, const RadiusSearch& search) 
 // Decide one cloud; returns its largest cell coordinate, and decides nothing when that is too large.
 double search_cloud(const pc_context& context, const RadiusSearch& search) {
   ScratchFrame scratch;
-  const math::Bounds box = parallel_bounds(context, search.points, search.count);
+  math::Bounds box = parallel_bounds(context, search.points, search.count);
   const double side = cell_side(search.radius);
-  const double largest = largest_coordinate(box, side);
+  double largest = largest_coordinate(box, side);
+  if (largest >= kMostCellsPerAxis && search.within != nullptr) {  // what is far out may be no point
+    const Pick there = pick_all(scratch, search);
+    if (there.count == 0) return 0;
+    box = math::Bounds::of_point(search.points + 3 * int64_t{there.rows[0]});
+    for (int64_t i = 1; i < there.count; ++i) box.include(search.points + 3 * int64_t{there.rows[i]});
+    largest = largest_coordinate(box, side);
+  }
   if (largest >= kMostCellsPerAxis) return largest;
 
   int64_t marked = mark_by_sequence(context, search);
@@ -239,10 +264,10 @@ double search_cloud(const pc_context& context, const RadiusSearch& search) {
   };
   const bool many = search.count >= kManyPoints;
   if (many && marked >= search.count / kFew)
-    marked = clear_crowded(context, lattice, search.points, search.count, search.enough, search.outlier);
+    marked = clear_crowded(context, lattice, search.points, search.within, search.count, search.enough, search.outlier);
   if (marked == 0) return largest;
   if (marked >= search.count / kFew) {
-    search_among({nullptr, search.count});
+    search_among(pick_all(scratch, search));
     return largest;
   }
   if (many && marked > search.count / kSome) {
@@ -259,15 +284,16 @@ double search_cloud(const pc_context& context, const RadiusSearch& search) {
 
 PC_EXPORT int32_t pc_radius_outlier_mask(const pc_context* context, const float* points, const int64_t* ptr,
                                          int64_t clouds, double radius, int64_t min_neighbors, const int64_t* pixel,
-                                         int64_t width, uint8_t* outlier, double* largest) {
+                                         int64_t width, const uint8_t* within, uint8_t* outlier, double* largest) {
   using namespace pc;
   using namespace pc::cells;
   return guarded([&] {
     const auto narrow = static_cast<float>(radius);
     std::atomic<double> most{0};
     for_each_cloud(*context, ptr, clouds, [&](const pc_context& own, int64_t first, int64_t count) {
-      raise_to(most, search_cloud(own, {points + 3 * first, count, narrow, narrow * narrow, min_neighbors + 1,
-                                        outlier + first, pixel ? pixel + first : nullptr, width}));
+      raise_to(most, search_cloud(
+                         own, {points + 3 * first, count, narrow, narrow * narrow, min_neighbors + 1, outlier + first,
+                               pixel ? pixel + first : nullptr, width, within ? within + first : nullptr}));
     });
     *largest = most.load();
   });

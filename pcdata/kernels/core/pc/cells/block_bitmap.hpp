@@ -37,8 +37,8 @@ class BlockBitmap {
         }
   }
 
-  // Write the points of [piece) in marked blocks to `rows`, rising; returns how many.
-  int64_t pick(const float* points, Range piece, uint32_t* rows) const {
+  // Write the points of [piece) in marked blocks to `rows`, rising; returns how many. Of points `within`, if not null.
+  int64_t pick(const float* points, const uint8_t* within, Range piece, uint32_t* rows) const {
     Tile tile;
     alignas(64) uint32_t marked[kTile];
     int64_t picked = 0;
@@ -52,6 +52,7 @@ class BlockBitmap {
         any |= marked[i];
       }
       if (!any) continue;
+      for (int i = 0; within != nullptr && i < count; ++i) marked[i] &= within[begin + i] != 0;
       for (int i = 0; i < count; ++i) {
         rows[picked] = static_cast<uint32_t>(begin + i);
         picked += marked[i];

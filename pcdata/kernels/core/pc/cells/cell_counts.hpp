@@ -55,11 +55,12 @@ class CellCounts {
   uint64_t* entries_;
 };
 
-// Clear the mark of points in cells that hold `enough` points or more; returns how many points stay marked.
+// Clear the mark of points in cells that hold `enough` points or more, of those `within`, if not null; returns how many
+// points stay marked.
 //
 // Gives up where cells hold fewer than twice as many on average: then nobody knows how many stay, and all may.
-inline int64_t clear_crowded(const pc_context& context, const Lattice& lattice, const float* points, int64_t count,
-                             int64_t enough, uint8_t* marks) {
+inline int64_t clear_crowded(const pc_context& context, const Lattice& lattice, const float* points,
+                             const uint8_t* within, int64_t count, int64_t enough, uint8_t* marks) {
   constexpr int64_t kMostTables = 8;
   const auto wanted = static_cast<uint64_t>(enough);
   if (wanted > CellCounts::kMost || !lattice.fits_narrow()) return count;
@@ -88,6 +89,7 @@ inline int64_t clear_crowded(const pc_context& context, const Lattice& lattice, 
       tile_keys(lattice, tile, number, keys);
       for (int i = 0; i < number; ++i) table.prefetch(keys[i]);
       for (int i = 0; i < number; ++i) {
+        if (within != nullptr && !within[begin + i]) continue;
         waiting[last] = {keys[i], static_cast<uint32_t>(begin + i)};
         const bool waits = table.add(keys[i]) < wanted;
         marks[begin + i] &= waits;
