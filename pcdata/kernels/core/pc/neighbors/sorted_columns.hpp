@@ -69,9 +69,7 @@ struct NetworkOf {
   }
   template <size_t kLow, size_t kHigh>
   [[gnu::always_inline]] static void exchange_two(FloatRegister (&v)[kCount]) {
-    const FloatRegister low = minimum(v[kLow], v[kHigh]);
-    v[kHigh] = maximum(v[kLow], v[kHigh]);
-    v[kLow] = low;
+    put_in_order(v[kLow], v[kHigh]);
   }
   template <size_t... I>
   [[gnu::always_inline]] static void run_lanes(Row* rows, int lane, std::index_sequence<I...>) {
