@@ -115,14 +115,14 @@ inline FloatRegister square_root(FloatRegister a) {
 }
 #endif
 
-// Put two numbers in order, neither of them NaN or a negative one but -infinity: what is left has the bits of an integer
-// that ascends with the number. Processors compare integers and floats in different units (Zen 4 integers twice as
-// fast), so that one of each takes half the time of two alike.
+// Put two numbers in order, neither of them NaN or a negative one but -infinity: what is left has the bits of an
+// integer that ascends with the number. Processors compare integers and floats in different units (Zen 4 integers twice
+// as fast), so that one of each takes half the time of two alike.
 inline void put_in_order(FloatRegister& low, FloatRegister& high) {
   const FloatRegister a = low, b = high;
 #if defined(PC_AVX512)
-  low = reinterpret_cast<FloatRegister>(_mm512_maskz_min_epi32(kAll16, reinterpret_cast<__m512i>(a),
-                                                               reinterpret_cast<__m512i>(b)));
+  low = reinterpret_cast<FloatRegister>(
+      _mm512_maskz_min_epi32(kAll16, reinterpret_cast<__m512i>(a), reinterpret_cast<__m512i>(b)));
 #elif defined(__AVX2__)
   low = reinterpret_cast<FloatRegister>(_mm256_min_epi32(reinterpret_cast<__m256i>(a), reinterpret_cast<__m256i>(b)));
 #else

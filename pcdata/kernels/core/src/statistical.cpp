@@ -9,10 +9,10 @@
 namespace pc::neighbors {
 namespace {
 
-// Sums of float32 distances in double are exact, so that their order does not matter, where the farthest is at most so
-// many times the nearest that is not at distance 0: with up to 2^8 of them, the last bit of the least is worth at least
-// 2^-53 of the sum.
-constexpr float kExactRange = 1 << 20;
+// Sums of float32 distances in double are exact, so that their order does not matter, where the farthest is at most
+// 2^20 times the nearest: with up to 2^8 of them, the last bit of the least is worth at least 2^-53 of the sum. Of
+// squared distances.
+constexpr float kExactRange = int64_t{1} << 40;
 constexpr int kMost = NearestDistances::kMax;
 
 // The mean of so many distances, summed nearest first.
@@ -41,19 +41,16 @@ struct MeanDistance {
     write(total / found, group.active, row);
   }
 
-  // Of squared distances (k - 1, 16) in no order, the query itself left out.
-  void operator()(const Row* squared, PackMask lanes, const uint32_t* row) const {
+  // Of a list of squared distances, the query itself left out.
+  template <int kBlocks>
+  void operator()(const WindowList<kBlocks>& list, PackMask lanes, const uint32_t* row) const {
+    const Row* squared = list.squared();
     DoublePack total(0.0);
-    FloatPack least(kInfinity), most(0.0f);
-    for (int i = 0; i < k - 1; ++i) {
-      const FloatPack distance = square_root(FloatPack::load(squared[i]));
-      least = minimum(distance, least);
-      most = maximum(distance, most);
-      total = total + widen(distance);
-    }
+    for (int i = 0; i < k - 1; ++i) total = total + widen(square_root(FloatPack::load(squared[i])));
     write(total / DoublePack(static_cast<double>(k)), lanes, row);
     // Copies at distance 0 are as rare as distances of such a range, or too large for a float.
-    const PackMask exact = less_equal(most, least * FloatPack(kExactRange)) & less(most, FloatPack(kInfinity));
+    const PackMask exact =
+        less_equal(list.bound(), list.least() * FloatPack(kExactRange)) & less(list.bound(), FloatPack(kInfinity));
     for (PackMask left = lanes & ~exact; left != 0; left &= left - 1) {
       const int lane = __builtin_ctz(left);
       float own[kMost] = {};  // the first is the query itself

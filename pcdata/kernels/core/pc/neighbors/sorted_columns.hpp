@@ -63,6 +63,9 @@ struct NetworkOf {
       kKind == Network::kSorting ? sorting_exchanges<kCount>() : merging_exchanges<kCount>();
 
   // GCC keeps an array in registers only when its indices are constants from the start: hence the folds.
+  [[gnu::always_inline]] static void exchange(FloatRegister (&v)[kCount]) {
+    exchange(v, std::make_index_sequence<static_cast<size_t>(kExchanges.count)>());
+  }
   template <size_t... E>
   [[gnu::always_inline]] static void exchange(FloatRegister (&v)[kCount], std::index_sequence<E...>) {
     (exchange_two<kExchanges.low[E], kExchanges.high[E]>(v), ...);
@@ -74,7 +77,7 @@ struct NetworkOf {
   template <size_t... I>
   [[gnu::always_inline]] static void run_lanes(Row* rows, int lane, std::index_sequence<I...>) {
     FloatRegister v[kCount] = {load<FloatRegister>(rows[I] + lane)...};
-    exchange(v, std::make_index_sequence<static_cast<size_t>(kExchanges.count)>());
+    exchange(v);
     (store(rows[I] + lane, v[I]), ...);
   }
   static void run(Row* rows) {
@@ -82,28 +85,22 @@ struct NetworkOf {
   }
 };
 
-template <Network kKind>
-inline void run_network(Row* rows, int blocks) {
+// Sort every column of so many blocks.
+inline void sort_columns(Row* rows, int blocks) {
   switch (blocks) {
     case 1:
-      return NetworkOf<kKind, 1 * kBlockRows>::run(rows);
+      return NetworkOf<Network::kSorting, 1 * kBlockRows>::run(rows);
     case 2:
-      return NetworkOf<kKind, 2 * kBlockRows>::run(rows);
+      return NetworkOf<Network::kSorting, 2 * kBlockRows>::run(rows);
     case 3:
-      return NetworkOf<kKind, 3 * kBlockRows>::run(rows);
+      return NetworkOf<Network::kSorting, 3 * kBlockRows>::run(rows);
     case 4:
-      return NetworkOf<kKind, 4 * kBlockRows>::run(rows);
+      return NetworkOf<Network::kSorting, 4 * kBlockRows>::run(rows);
     case 5:
-      return NetworkOf<kKind, 5 * kBlockRows>::run(rows);
+      return NetworkOf<Network::kSorting, 5 * kBlockRows>::run(rows);
     default:
-      return NetworkOf<kKind, 6 * kBlockRows>::run(rows);
+      return NetworkOf<Network::kSorting, 6 * kBlockRows>::run(rows);
   }
 }
-
-// Sort every column of so many blocks.
-inline void sort_columns(Row* rows, int blocks) { run_network<Network::kSorting>(rows, blocks); }
-
-// The same for columns that rise and then fall.
-inline void sort_rising_falling(Row* rows, int blocks) { run_network<Network::kMerging>(rows, blocks); }
 
 }  // namespace pc::neighbors

@@ -1,0 +1,148 @@
+// The least of the distances to pixels around sixteen queries.
+#pragma once
+
+#include "pc/neighbors/sorted_columns.hpp"
+
+namespace pc::neighbors {
+
+// The smallest squared distances to pixels around sixteen queries, the queries themselves left out.
+//
+// A list per lane holds `wanted` numbers in whole blocks of rows, those before them -infinity. What is least of two
+// ascending lists is least of the pairs of one's first with the other's last, its second with the other's last but one,
+// ...; that rises and then falls, and is sorted again only when more follows.
+//
+// As many distances as the list holds are worked out, sorted and merged without leaving the registers: hence the number
+// of blocks is known when this is compiled, and distances are asked for as body(i, lane), a register from a lane on.
+template <int kBlocks>
+class WindowList {
+ public:
+  static constexpr int kSize = kBlocks * kBlockRows;
+
+  explicit WindowList(int wanted) : wanted_(wanted) {
+    for (int i = 0; i < before(); ++i) FloatPack(-kInfinity).store(list_[i]);
+  }
+
+  // Begin with body(0), ... body(kSize - 1).
+  template <class Body>
+  void start(const Body& body) {
+    for_registers([&](int lane) __attribute__((always_inline)) {
+      Sorted sorted(body, 0, lane);
+      sorted.store(list_ + before(), lane);
+    });
+    bound_ = FloatPack::load(list_[kSize - 1]);
+    is_sorted_ = true;
+  }
+
+  // Take body(first), ... body(last - 1), whole blocks; those that could not change any of the lanes may be missed.
+  template <class Body>
+  void take(int first, int last, PackMask lanes, const Body& body) {
+    if (__builtin_popcount(lanes) <= kFew) return take_wanted(first, last, lanes, body);
+    for (; last - first >= kSize; first += kSize) {
+      sort_list();
+      for_registers([&](int lane) __attribute__((always_inline)) {
+        Sorted sorted(body, first, lane);
+        store(&bound_.part[lane / kLanes], sorted.merge(list_, lane));
+      });
+      is_sorted_ = false;
+    }
+    if (first == last) return;
+    for (int i = first; i < last; ++i) each(body, i).store(taken_[i - first]);
+    merge_taken(last - first);
+  }
+
+  // The largest that is wanted, and the least.
+  const FloatPack& bound() const { return bound_; }
+  FloatPack least() const { return minimum(FloatPack::load(list_[before()]), FloatPack::load(list_[kSize - 1])); }
+  // (wanted, 16), which rise or rise and then fall.
+  const Row* squared() const { return list_ + before(); }
+
+ private:
+  // Lanes for which it pays to look whether a number matters before it is sorted.
+  static constexpr int kFew = 6;
+
+  // One register of each of kSize distances, ascending.
+  struct Sorted {
+    FloatRegister v[kSize];
+
+    template <class Body>
+    [[gnu::always_inline]] Sorted(const Body& body, int first, int lane)
+        : Sorted(body, first, lane, std::make_index_sequence<kSize>()) {}
+    template <class Body, size_t... I>
+    [[gnu::always_inline]] Sorted(const Body& body, int first, int lane, std::index_sequence<I...>)
+        : v{body(first + static_cast<int>(I), lane)...} {
+      NetworkOf<Network::kSorting, kSize>::exchange(v);
+    }
+    [[gnu::always_inline]] void store(Row* to, int lane) const { store(to, lane, std::make_index_sequence<kSize>()); }
+    template <size_t... I>
+    [[gnu::always_inline]] void store(Row* to, int lane, std::index_sequence<I...>) const {
+      (pc::store(to[I] + lane, v[I]), ...);
+    }
+    // Leave what is less of the pairs in the list, and return the largest of that.
+    [[gnu::always_inline]] FloatRegister merge(Row* list, int lane) {
+      return merge(list, lane, std::make_index_sequence<kSize>());
+    }
+    template <size_t... I>
+    [[gnu::always_inline]] FloatRegister merge(Row* list, int lane, std::index_sequence<I...>) {
+      FloatRegister most = FloatRegister{} - kInfinity;
+      ((v[I] = minimum(v[I], load<FloatRegister>(list[kSize - 1 - I] + lane)), most = maximum(v[I], most),
+        pc::store(list[kSize - 1 - I] + lane, v[I])),
+       ...);
+      return most;
+    }
+  };
+
+  int before() const { return kSize - wanted_; }
+
+  template <class Body>
+  [[gnu::always_inline]] static void for_registers(Body&& body) {
+    for (int lane = 0; lane < kQueries; lane += kLanes) body(lane);
+  }
+  template <class Body>
+  [[gnu::always_inline]] static FloatPack each(const Body& body, int i) {
+    return FloatPack::each([&](size_t p) { return body(i, static_cast<int>(p) * kLanes); });
+  }
+
+  template <class Body>
+  void take_wanted(int first, int last, PackMask lanes, const Body& body) {
+    int taken = 0;
+    for (int i = first; i < last; ++i) {
+      const FloatPack squared = each(body, i);
+      squared.store(taken_[taken]);
+      taken += (less(squared, bound_) & lanes) != 0;
+      if (taken == kSize) {
+        merge_taken(taken);
+        taken = 0;
+      }
+    }
+    if (taken != 0) merge_taken(taken);
+  }
+
+  void sort_list() {
+    if (!is_sorted_) NetworkOf<Network::kMerging, kSize>::run(list_);
+    is_sorted_ = true;
+  }
+
+  void merge_taken(int taken) {
+    const int blocks = (taken + kBlockRows - 1) / kBlockRows, count = std::min(blocks * kBlockRows, wanted_);
+    for (int i = taken; i < blocks * kBlockRows; ++i) FloatPack(kInfinity).store(taken_[i]);
+    sort_columns(taken_, blocks);
+    sort_list();
+    FloatPack most = count < wanted_ ? FloatPack::load(list_[kSize - 1 - count]) : FloatPack(-kInfinity);
+    for (int i = 0; i < count; ++i) {
+      Row& own = list_[kSize - 1 - i];
+      const FloatPack lesser = minimum(FloatPack::load(own), FloatPack::load(taken_[i]));
+      lesser.store(own);
+      most = maximum(lesser, most);
+    }
+    bound_ = most;
+    is_sorted_ = false;
+  }
+
+  alignas(64) Row list_[kSize + kBlockRows];  // the first chunk may stand up to seven rows later
+  alignas(64) Row taken_[kSize];
+  FloatPack bound_{kInfinity};
+  int wanted_;
+  bool is_sorted_ = true;
+};
+
+}  // namespace pc::neighbors
