@@ -96,8 +96,10 @@ def _check_rigid(where: str, motion: Tensor, num_clouds: int, device: torch.devi
         raise ShapeError(f"{name} must be ({num_clouds}, 4, 4), one per cloud, got {tuple(motion.shape)}")
     if motion.device != device:
         raise DeviceError(f"{name} is on {motion.device} but points is on {device}; move one with .to()")
-    if is_known(RIGID, motion) or are_few_and_rigid(motion, tolerance=_MOST_OFF):
+    if is_known(RIGID, motion):
         return
+    if are_few_and_rigid(motion, tolerance=_MOST_OFF):
+        return note(RIGID, motion)
     wide = on_host(motion).double()
     rotation, last = wide[:, :3, :3], wide[:, 3]
     off = (rotation.mT @ rotation - torch.eye(3, dtype=wide.dtype, device="cpu")).abs().amax((1, 2))

@@ -11,7 +11,7 @@ import dataclasses
 import hashlib
 import inspect
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
@@ -36,9 +36,6 @@ from pcdata.structures import METRE, DepthFrame, PointCloud
 from pcdata.structures.read_later import OfClouds
 from pcdata.transforms.class_checks import check_class, undeclared_streams, watched
 from pcdata.transforms.decisions import (
-    LISTS,
-    PER_ROW,
-    TOLD_ROWS,
     Decision,
     Decisions,
     Entry,
@@ -46,11 +43,11 @@ from pcdata.transforms.decisions import (
     histories_of,
 )
 from pcdata.transforms.field_checks import field_names, length_fields, validated_fields
+from pcdata.transforms.noted_steps import NotedSteps, read_in_histories
 from pcdata.transforms.row_sums import row_sums
 
 Data = DepthFrame | PointCloud
 Params = dict[str, Tensor]
-_Values = NDArray[Any] | Tensor  # of params: on another device they are read when they are asked for
 
 REGISTRY: Registry[type[Transform]] = Registry("transform")
 
@@ -342,7 +339,7 @@ class Transform(nn.Module):
         """
         rows = self.told_rows(data, params)
         if isinstance(result, DepthFrame):
-            (step,) = _NotedSteps(self._note(), _small(params, 1), drawn=drawn, rows=rows)
+            (step,) = NotedSteps(self._note(), read_in_histories(params, 1), drawn=drawn, rows=rows)
             return result.with_provenance({"history": [*result.provenance.get("history", ()), step]})
         before = counts_of(data.ptr) if isinstance(data, PointCloud) and self.keeps_clouds else None
         return self.recorded_counts(result, before, counts_of(result.ptr), params, drawn=drawn, rows=rows)
@@ -389,7 +386,7 @@ class Transform(nn.Module):
         frame, unit = place or (result.frame_id, result.unit)
         note = {**self._note(), "frame": frame, "unit": unit}
         return result.with_steps(
-            _NotedSteps(note, _small(params, len(after)), before if keeps else None, after, drawn, rows)
+            NotedSteps(note, read_in_histories(params, len(after)), before if keeps else None, after, drawn, rows)
         )
 
     def _note(self) -> dict[str, Any]:
@@ -404,54 +401,6 @@ class Transform(nn.Module):
         return note
 
 
-class _NotedSteps:
-    """What a step did to each cloud of a batch, or to a capture, as entries of histories that are made when read."""
-
-    __slots__ = ("_after", "_before", "_drawn", "_note", "_params", "_rows")
-
-    def __init__(
-        self,
-        note: dict[str, Any],
-        params: dict[str, _Values],  # (B, ...) each
-        before: list[int] | None = None,  # points of each cloud; None = other clouds
-        after: list[int] | None = None,  # None = a capture
-        drawn: NDArray[np.int64] | None = None,  # the stream of each cloud; None = the step is not random
-        rows: Sequence[int] | None = None,  # a number that tells the rows of each
-    ) -> None:
-        self._note, self._params, self._drawn, self._rows = note, params, drawn, rows
-        self._before, self._after = before, after
-
-    def __len__(self) -> int:
-        return 1 if self._after is None else len(self._after)
-
-    def __getitem__(self, clouds: slice) -> _NotedSteps:
-        params = {name: value[clouds] for name, value in self._params.items()}
-        lists = (self._before, self._after, self._drawn, self._rows)
-        return _NotedSteps(self._note, params, *(None if one is None else one[clouds] for one in lists))  # type: ignore[arg-type]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        params = {name: np.asarray(values.tolist()) for name, values in self._params.items()}
-        return _NotedSteps, (self._note, params, self._before, self._after, self._drawn, self._rows)
-
-    def __iter__(self) -> Iterator[dict[str, Any]]:
-        listed = {name: value.tolist() for name, value in self._params.items()}
-        drawn = None if self._drawn is None else self._drawn.tolist()
-        for b in range(1 if self._after is None else len(self._after)):
-            # Each entry may be changed where it is read, so lists are given anew.
-            entry = {**self._note, "fields": _anew(self._note["fields"])}
-            # What is NaN is not known, and not told.
-            entry["params"] = {name: values[b] for name, values in listed.items() if values[b] == values[b]}
-            if drawn is not None:
-                entry["stream"] = drawn[b]
-            if self._rows is not None:
-                entry["rows"] = self._rows[b]
-            if self._before is not None:
-                entry["points_before"] = self._before[b]
-            if self._after is not None:
-                entry["points"] = self._after[b]
-            yield entry
-
-
 def _for_data(step: Transform, data: Any, decisions: list[Decision], for_all: bool) -> Decisions:
     """Return what a step decided about the clouds of the data, or about those that it makes of them."""
     name = type(step).__name__
@@ -464,15 +413,6 @@ def _for_data(step: Transform, data: Any, decisions: list[Decision], for_all: bo
                 "history of each, in their order, or that of one for all"
             )
     return Decisions(name, decisions)
-
-
-def _anew(fields: dict[str, Any]) -> dict[str, Any]:
-    """Copy fields, and the lists of numbers, or of rows of numbers, among them."""
-    copy = {**fields}
-    for name, value in fields.items():
-        if type(value) is list:
-            copy[name] = [*map(list, value)] if value and type(value[0]) is list else [*value]
-    return copy
 
 
 def unit_advice(step: Transform) -> str:
@@ -521,17 +461,3 @@ def sha256_of(identity: Any) -> str:
     """Return the SHA-256 of plain data."""
     text = json.dumps(identity, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _small(params: Params, num: int) -> dict[str, _Values]:
-    """Keep the params worth reading in a history: a few numbers per cloud, not indices or noise.
-
-    Those on another device stay there until somebody reads them.
-    """
-    kept: dict[str, _Values] = {}
-    for name, value in params.items():
-        # By name, not by shape alone: with one point per cloud the shapes are the same.
-        is_per_cloud = name not in PER_ROW and name not in LISTS and name != TOLD_ROWS
-        if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value.numel() <= 16 * num:
-            kept[name] = value.detach().numpy() if value.device.type == "cpu" else value.detach()
-    return kept
