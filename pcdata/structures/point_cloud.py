@@ -226,15 +226,19 @@ class PointCloud(CloudBatch):
         Rows of a cloud must stay within that cloud. A mask keeps their order, and so the image they lie on.
 
         Raises:
-            ShapeError: ptr (B+1,) int64 does not cut the M rows into B clouds.
+            ShapeError: index has other than one dimension, or ptr (B+1,) int64 does not cut the M rows into B clouds.
         """
         given = {"points": self.points, "ptr": ptr}
         sizes = check_tensors("PointCloud", given, _SELECTED, check_values=False)
         if sizes["B"] != self.num_clouds:
             raise ShapeError(f"PointCloud.select: ptr cuts {sizes['B']} clouds out of {self.num_clouds}")
         is_mask, count = index.dtype is torch.bool, None
+        if index.ndim != 1:
+            raise ShapeError(
+                f"PointCloud.select: index must be rows (M,) or a mask (N,), got shape {tuple(index.shape)}"
+            )
         if is_mask and self.device.type == "cpu":
-            count = int(ptr[-1])  # if it is wrong, it is checked below
+            count = min(max(int(ptr[-1]), 0), self.num_points)  # if ptr is wrong, that is told below
         elif is_mask and index.shape == (self.num_points,):
             (found,), bounds = read_together([index.sum(), ptr])
             hold(ptr, torch.tensor(bounds, dtype=ptr.dtype, device="cpu"))

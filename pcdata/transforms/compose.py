@@ -163,7 +163,7 @@ class Compose(Transform):
             sources = None
             # What a step gives may share its memory with what it got, or with its params.
             is_own = False
-            if position >= singly and isinstance(data, PointCloud) and are_many(data.num_points):
+            if position >= singly and isinstance(data, PointCloud):
                 singly = position + selections_from(steps, position)
                 cloud = _selected(steps, range(position, singly), data, told)
                 if cloud is not None:
@@ -360,7 +360,7 @@ def _selected(steps: Sequence[Transform], positions: range, cloud: PointCloud, t
     if len(positions) < 2:
         return None
     together = steps[positions.start : positions.stop]
-    parts = SetAside.of_cloud(cloud, looked_at(together))
+    parts = SetAside.of_cloud(cloud, looked_at(together)) if are_many(cloud.num_points) else None
     if parts is not None:
         return run_selections(steps, positions, parts[1], parts[0], told)
     return run_selections(steps, positions, cloud, None, told) if pick_together(together) else None

@@ -155,6 +155,19 @@ def test_select_refuses_row_pointers_that_do_not_cut_the_result():
         cloud.select(torch.tensor([0, 1]), torch.tensor([0, 2]))
 
 
+@pytest.mark.parametrize("end", [-3, 0, 4, 6, 10**15])
+def test_select_refuses_row_pointers_that_end_elsewhere_than_a_mask(end):
+    keep = torch.tensor([True] * 5 + [False])
+    with pytest.raises(ShapeError, match="ptr must"):
+        cloud_in_base([6]).select(keep, torch.tensor([0, end]))
+
+
+@pytest.mark.parametrize("index", [torch.ones(6, 1).bool(), torch.zeros(2, 3).long(), torch.tensor(1)], ids=str)
+def test_select_refuses_rows_in_other_than_one_dimension(index):
+    with pytest.raises(ShapeError, match=r"index must be rows \(M,\) or a mask"):
+        cloud_in_base([6]).select(index, torch.tensor([0, 6]))
+
+
 # -- moving --------------------------------------------------------------------------------------------------------
 
 
