@@ -25,6 +25,7 @@ class Contract:
     signature: inspect.Signature
     tensors: dict[str, str]  # argument -> contract string; row pointers last, when the number of rows is known
     others: dict[str, Spec]
+    _names: frozenset[str]
     _positional: tuple[str, ...]
     _defaults: dict[str, Any]
     _required: tuple[str, ...]  # tensors that may not be None
@@ -46,6 +47,7 @@ class Contract:
             signature=signature,
             tensors=dict(sorted(texts.items(), key=lambda item: parsed[item[0]].is_ptr)),
             others={key: spec for key, spec in specs.items() if not isinstance(spec, str)},
+            _names=frozenset(defaults),
             _positional=tuple(
                 name
                 for name, parameter in signature.parameters.items()
@@ -71,11 +73,7 @@ class Contract:
         """
         given = dict(zip(self._positional, args))
         arguments = {**self._defaults, **given, **kwargs}
-        if (
-            len(given) == len(args)
-            and given.keys().isdisjoint(kwargs)
-            and arguments.keys() == self.signature.parameters.keys()
-        ):
+        if len(given) == len(args) and given.keys().isdisjoint(kwargs) and arguments.keys() == self._names:
             return arguments
         self.signature.bind(*args, **kwargs)
         raise AssertionError(f"{self.name}: the arguments fit after all")

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
 _SHORTEST, _LONGEST = 1e-6, 1e3  # seconds: what lies outside is counted in the first and the last bin
 _PER_FACTOR_E = 50  # bins per factor e: each is 2 % wide
+_WAITING = 64  # latencies
 _BINS = math.ceil(_PER_FACTOR_E * math.log(_LONGEST / _SHORTEST)) + 1
 
 
@@ -27,24 +30,31 @@ class Latency:
 
 
 class Histogram:
-    """Counts of latencies in bins that grow by 2 %."""
+    """Counts of latencies in bins that grow by 2 %: one thread adds, any may read."""
 
     def __init__(self) -> None:
-        self._counts = [0] * _BINS  # not an array: to count one up takes ten times as long there
+        self._counts = np.zeros(_BINS, np.int64)
+        self._waiting: list[float] = []  # to be put into bins: many at once take little longer than one
+        self._moving = Lock()
         self._sum = self._worst = 0.0
 
     def add(self, seconds: float) -> None:
         """Count one latency."""
-        place = math.ceil(_PER_FACTOR_E * math.log(max(seconds, _SHORTEST) / _SHORTEST))
-        self._counts[place if place < _BINS else _BINS - 1] += 1
         self._sum += seconds
-        if seconds > self._worst:
-            self._worst = seconds
+        self._worst = max(self._worst, seconds)
+        self._waiting.append(seconds)
+        if len(self._waiting) >= _WAITING:
+            with self._moving:
+                _count(self._waiting, self._counts)
+                self._waiting.clear()
 
     @property
     def counts(self) -> NDArray[np.int64]:
         """(bins,) how many there were of each length."""
-        return np.array(self._counts, np.int64)
+        with self._moving:
+            counts = self._counts.copy()
+            _count(self._waiting, counts)
+            return counts
 
     def percentile(self, share: float) -> float:
         """Return the seconds that ``share`` (0..1) of all latencies do not exceed; 0 where there are none."""
@@ -66,7 +76,7 @@ class Histogram:
 
     def summary(self) -> Latency:
         """Return what a reader asks for."""
-        count = sum(self._counts)
+        count = int(self.counts.sum())
         median, p90, p99, p999 = (self.percentile(share) for share in (0.5, 0.9, 0.99, 0.999))
         return Latency(
             count=count,
@@ -77,3 +87,9 @@ class Histogram:
             p999=p999,
             worst=self._worst,
         )
+
+
+def _count(latencies: Sequence[float], counts: NDArray[np.int64]) -> None:
+    for seconds in latencies:
+        place = math.ceil(_PER_FACTOR_E * math.log(max(seconds, _SHORTEST) / _SHORTEST))
+        counts[min(place, _BINS - 1)] += 1

@@ -119,6 +119,7 @@ class LivePipeline:
         self._copies: list[Tensor] = []  # two at most, used in turns
         self._turn = Lock()  # held while a frame is worked on
         self._names = [type(step).__name__ for step in self.chain.steps]
+        self._pass_names: dict[tuple[int, int], str] = {}
         self._number = 0
         self._fixed: FixedFrames | None = None
         self.reset_stats()
@@ -244,7 +245,7 @@ class LivePipeline:
         def after(steps: range, _: Any) -> None:
             nonlocal since
             now = time.perf_counter()
-            self._count(" + ".join(self._names[done + position] for position in steps), now - since)
+            self._count(self._pass_name(done + steps.start, done + steps.stop), now - since)
             since = now
 
         with torch.no_grad(), guessing_planes(self._planes):
@@ -261,6 +262,12 @@ class LivePipeline:
         if self._warm_planes and "RemovePlane" not in self.captured:  # which searches anew, and tells later
             self._planes = cloud.meta[0].get("planes", ())
         return cloud
+
+    def _pass_name(self, start: int, stop: int) -> str:
+        name = self._pass_names.get((start, stop))
+        if name is None:
+            name = self._pass_names[start, stop] = " + ".join(self._names[start:stop])
+        return name
 
     def _count(self, name: str, seconds: float) -> None:
         taken = self._passes.get(name)
