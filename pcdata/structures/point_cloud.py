@@ -238,13 +238,13 @@ class PointCloud(CloudBatch):
                 f"PointCloud.select: index must be rows (M,) or a mask (N,), got shape {tuple(index.shape)}"
             )
         if is_mask and self.device.type == "cpu":
-            count = min(max(int(ptr[-1]), 0), self.num_points)  # if ptr is wrong, that is told below
+            count = min(max(bounds_of(ptr)[-1], 0), self.points.shape[0])  # if ptr is wrong, that is told below
         elif is_mask and index.shape == (self.num_points,):
             (found,), bounds = read_together([index.sum(), ptr])
             hold(ptr, torch.tensor(bounds, dtype=ptr.dtype, device="cpu"))
             index = rows_of_mask(index, found)
         rows = pick_rows(self.fields(), index, count=count)
-        check_ptr_values("PointCloud", "ptr", ptr, len(rows["points"]))
+        check_ptr_values("PointCloud", "ptr", ptr, rows["points"].shape[0])
         layout = self.layout if is_mask else None
         if is_known(FINITE, self.points):
             note(FINITE, rows["points"])

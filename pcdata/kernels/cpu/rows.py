@@ -25,9 +25,10 @@ _MANY_ROWS = 300_000  # of all fields: some megabytes, which are worth a look at
 @kernel("kept_rows", "cpu")
 def kept_rows(marks: Tensor, ptr: Tensor, *, gone: bool = False, within: Tensor | None = None) -> KeptRows:
     """Turn marks, count them and sum them up in one look."""
-    keep, kept_ptr, sums = room(marks.shape, torch.bool), room(ptr.shape, torch.int64), room(len(ptr) - 1, torch.int64)
+    clouds = ptr.shape[0] - 1
+    keep, kept_ptr, sums = room(marks.shape, torch.bool), room(clouds + 1, torch.int64), room(clouds, torch.int64)
     others = None if within is None else within.contiguous()
-    call("pc_kept_rows", marks.contiguous(), gone, others, ptr.contiguous(), len(ptr) - 1, keep, kept_ptr, sums)
+    call("pc_kept_rows", marks.contiguous(), gone, others, ptr.contiguous(), clouds, keep, kept_ptr, sums)
     return KeptRows(keep, kept_ptr, sums)
 
 
@@ -54,13 +55,14 @@ def pick_rows(
 
 def _keep_rows(fields: Sequence[Tensor], mask: Tensor, count: int | None) -> list[Tensor]:
     """Return the rows of a mask; a count that turns out to be wrong does no harm."""
-    kept = room(1, torch.int64)
+    kept, rows = room(1, torch.int64), mask.shape[0]
     if count is None:
-        call("pc_keep_rows", mask, len(mask), -1, 0, numbers(()), numbers(()), numbers(()), kept)
-        count = int(kept)
+        call("pc_keep_rows", mask, rows, -1, 0, numbers(()), numbers(()), numbers(()), kept)
+        count = int(kept.item())
     sources, picked, sizes = _sources_and_picked(fields, count)
-    call("pc_keep_rows", mask, len(mask), count, len(fields), addresses(sources), sizes, addresses(picked), kept)
-    return picked if int(kept) == count else _keep_rows(fields, mask, int(kept))
+    call("pc_keep_rows", mask, rows, count, len(fields), addresses(sources), sizes, addresses(picked), kept)
+    found = int(kept.item())
+    return picked if found == count else _keep_rows(fields, mask, found)
 
 
 def _keep_rows_in_place(fields: Sequence[Tensor], mask: Tensor) -> list[Tensor]:
