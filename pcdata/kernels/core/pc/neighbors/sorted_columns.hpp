@@ -80,7 +80,8 @@ struct NetworkOf {
     exchange(v);
     (store(rows[I] + lane, v[I]), ...);
   }
-  static void run(Row* rows) {
+  // On its own, lest GCC runs out of registers where it is called from.
+  [[gnu::noinline]] static void run(Row* rows) {
     for (int lane = 0; lane < kQueries; lane += kLanes) run_lanes(rows, lane, std::make_index_sequence<kCount>());
   }
 };

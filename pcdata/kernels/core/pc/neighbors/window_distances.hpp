@@ -145,7 +145,7 @@ class WindowDistances {
       return load<FloatRegister>(stragglers.squared[i] + lane);
     };
     list.start(squared);
-    list.take(List::kSize, longest, ~PackMask{0}, squared);
+    list.take(List::kSize, longest, squared);
     task_(list, (PackMask{1} << stragglers.number) - 1, stragglers.row);
     stragglers.number = stragglers.longest = 0;
   }
@@ -156,7 +156,7 @@ class WindowDistances {
         cloud_.x() + at, cloud_.y() + at, cloud_.z() + at, {queries.x, queries.y, queries.z}, offset_.data()};
     int reach = first_reach(k_);
     list.start(around);
-    if (pixels_around(reach) > List::kSize) list.take(List::kSize, pixels_around(reach), queries.active, around);
+    if (pixels_around(reach) > List::kSize) list.take(List::kSize, pixels_around(reach), around);
     for (;;) {
       const FloatPack bound = list.bound();
       const PackMask proved = less(bound, place.clear_within(reach)) & queries.active, open = queries.active & ~proved;
@@ -164,7 +164,7 @@ class WindowDistances {
       const PackMask hopeful = less(bound, place.clear_within(max_reach(k_))) & open;
       const PackMask lost = open & ~less(bound, FloatPack(kInfinity));
       if (__builtin_popcount(hopeful) < kWorth && lost == 0) return proved;
-      list.take(pixels_around(reach), pixels_around(reach + 1), open, around);
+      list.take(pixels_around(reach), pixels_around(reach + 1), around);
       ++reach;
     }
   }

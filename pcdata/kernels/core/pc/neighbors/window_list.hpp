@@ -13,6 +13,7 @@ namespace pc::neighbors {
 //
 // As many distances as the list holds are worked out, sorted and merged without leaving the registers: hence the number
 // of blocks is known when this is compiled, and distances are asked for as body(i, lane), a register from a lane on.
+// What does so stays a function of its own: inlined, GCC gives it too few registers.
 template <int kBlocks>
 class WindowList {
  public:
@@ -24,7 +25,7 @@ class WindowList {
 
   // Begin with body(0), ... body(kSize - 1).
   template <class Body>
-  void start(const Body& body) {
+  [[gnu::noinline]] void start(const Body& body) {
     for_registers([&](int lane) __attribute__((always_inline)) {
       Sorted sorted(body, 0, lane);
       sorted.store(list_ + before(), lane);
@@ -33,10 +34,9 @@ class WindowList {
     is_sorted_ = true;
   }
 
-  // Take body(first), ... body(last - 1), whole blocks; those that could not change any of the lanes may be missed.
+  // Take body(first), ... body(last - 1), whole blocks.
   template <class Body>
-  void take(int first, int last, PackMask lanes, const Body& body) {
-    if (__builtin_popcount(lanes) <= kFew) return take_wanted(first, last, lanes, body);
+  [[gnu::noinline]] void take(int first, int last, const Body& body) {
     for (; last - first >= kSize; first += kSize) {
       sort_list();
       for_registers([&](int lane) __attribute__((always_inline)) {
@@ -47,7 +47,7 @@ class WindowList {
     }
     if (first == last) return;
     for (int i = first; i < last; ++i) each(body, i).store(taken_[i - first]);
-    merge_taken(last - first);
+    merge_taken((last - first) / kBlockRows);
   }
 
   // The largest that is wanted, and the least.
@@ -57,9 +57,6 @@ class WindowList {
   const Row* squared() const { return list_ + before(); }
 
  private:
-  // Lanes for which it pays to look whether a number matters before it is sorted.
-  static constexpr int kFew = 6;
-
   // One register of each of kSize distances, ascending.
   struct Sorted {
     FloatRegister v[kSize];
@@ -102,29 +99,13 @@ class WindowList {
     return FloatPack::each([&](size_t p) { return body(i, static_cast<int>(p) * kLanes); });
   }
 
-  template <class Body>
-  void take_wanted(int first, int last, PackMask lanes, const Body& body) {
-    int taken = 0;
-    for (int i = first; i < last; ++i) {
-      const FloatPack squared = each(body, i);
-      squared.store(taken_[taken]);
-      taken += (less(squared, bound_) & lanes) != 0;
-      if (taken == kSize) {
-        merge_taken(taken);
-        taken = 0;
-      }
-    }
-    if (taken != 0) merge_taken(taken);
-  }
-
   void sort_list() {
     if (!is_sorted_) NetworkOf<Network::kMerging, kSize>::run(list_);
     is_sorted_ = true;
   }
 
-  void merge_taken(int taken) {
-    const int blocks = (taken + kBlockRows - 1) / kBlockRows, count = std::min(blocks * kBlockRows, wanted_);
-    for (int i = taken; i < blocks * kBlockRows; ++i) FloatPack(kInfinity).store(taken_[i]);
+  [[gnu::noinline]] void merge_taken(int blocks) {
+    const int count = std::min(blocks * kBlockRows, wanted_);
     sort_columns(taken_, blocks);
     sort_list();
     FloatPack most = count < wanted_ ? FloatPack::load(list_[kSize - 1 - count]) : FloatPack(-kInfinity);
