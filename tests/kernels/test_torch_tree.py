@@ -55,6 +55,16 @@ def test_the_tree_gives_what_all_pairs_give(shape):
             assert_both_equal(F.chamfer_distance, points, ptr, queries, queries_ptr)
 
 
+def test_more_neighbors_than_there_are_points_are_not_looked_for(monkeypatch):
+    points, ptr = torch.rand(2000, 3, generator=seeded(0)), ptr_from_counts([1200, 800])
+    expected = F.radius_outlier_mask(points, ptr, min_neighbors=1200, radius=2.0, backend="torch")
+    assert expected.all()
+    monkeypatch.delattr("pcdata.kernels.torch_tree.outliers.nearest_chunks")
+    for enough in (1200, 10**6, 10**12):
+        found = F.radius_outlier_mask(points, ptr, min_neighbors=enough, radius=2.0, backend="torch_tree")
+        assert torch.equal(found, expected)
+
+
 def test_both_refuse_a_radius_too_small_for_the_cloud():
     points = torch.tensor([[0.0, 0.0, 0.0], [1e9, 0.0, 0.0]])
     for backend in ("torch_tree", "torch"):

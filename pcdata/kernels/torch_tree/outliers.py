@@ -6,6 +6,7 @@ from torch import Tensor
 
 import pcdata.functional.outliers  # noqa: F401 - the operation must be registered before its kernel
 from pcdata.contracts.dispatch import kernel
+from pcdata.contracts.on_host import counts_of
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.rows import picked_rows
 from pcdata.kernels.torch_tree.cells import Cells
@@ -20,7 +21,7 @@ def radius_outlier_mask(
     # All points of a cell are within the radius of each other: a full cell needs no distances.
     outlier = Cells.within("radius_outlier_mask", points, ptr, radius).crowd() <= min_neighbors
     undecided, undecided_ptr = picked_rows(outlier, ptr)
-    if len(undecided) == 0:
+    if len(undecided) == 0 or min_neighbors >= max(counts_of(ptr)):  # in no cloud there are enough
         return outlier
     searches = nearest_chunks(
         points,
