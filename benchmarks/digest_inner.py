@@ -213,11 +213,7 @@ def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     places = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 0.9]], dtype=torch.float64)
     yield "reaches", "two", lambda: ((cloud, ptr, places, 0.01), {})
     seen, leaning = cloud[:, 2] > 0.05, torch.tensor([0.6, 0.0, 0.8, -0.05], dtype=torch.float64)
-    axes = torch.tensor([[0.0, 1.0, 0.0], [-0.8, 0.0, 0.6]], dtype=torch.float64)
-    yield "outline_rows", "two", lambda: ((cloud, seen, leaning, axes), {})
-    yield "patch_cells", "two", lambda: ((cloud, seen, leaning, axes, 0.05), {})
-    checkered = (torch.arange(6)[:, None] + torch.arange(5)) % 2 == 0
-    yield "points_in_cells", "two", lambda: ((cloud, seen, axes, torch.zeros(2).double(), 30.0, checkered), {})
+    yield "plane_surfaces", "two", lambda: ((cloud, ptr, seen, torch.stack([leaning, leaning]), 0.05), {})
     level, ones = torch.tensor([0.0, 0.0, 1.0, -0.05], dtype=torch.float64), torch.ones(126, dtype=torch.float64)
     yield "fit_surface", "level", lambda: ((cloud, ones, level, 0.03, "digest"), {})
     jaw = ParallelJaw(

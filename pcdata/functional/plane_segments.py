@@ -15,20 +15,17 @@ from pcdata.contracts.on_host import bounds_of
 from pcdata.errors import NoPlaneError, UnitError
 from pcdata.functional.clusters import density_clusters
 from pcdata.functional.neighbors import nearest_rows
+from pcdata.functional.plane_arguments import checked_probability, checked_seeds, checked_tilt, checked_up
 from pcdata.functional.plane_choice import chosen_plane
-from pcdata.functional.planes import (
+from pcdata.functional.plane_steps import (
     bound_runs,
-    checked_probability,
-    checked_seeds,
-    checked_tilt,
-    checked_up,
     draw_planes,
     near_planes,
-    ransac_plane,
     record_planes,
     refine_planes,
     search_planes,
 )
+from pcdata.functional.planes import ransac_plane
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.voxels import voxel_downsample
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pcdata.contracts.on_host import counts_of
 from pcdata.errors import NoShapeError
-from pcdata.functional.planes import draw_rows
+from pcdata.functional.row_draws import draw_rows
 from pcdata.functional.rows import cloud_of_rows, count_per_cloud, counts_from_ptr, ptr_from_counts
 from pcdata.geometry.rigid import angle_between
 from pcdata.geometry.shape_fit import Family, length

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -185,11 +186,13 @@ def plane_axes(plane: Tensor) -> Tensor:
 
     With the normal as third they are right-handed, so counterclockwise is seen from the side that it points to.
     """
-    normal = plane[:3].double()
-    axis = torch.eye(3, dtype=torch.float64, device=normal.device)[normal.abs().argmin()]
-    first = torch.linalg.cross(normal, axis)
-    first = first / first.norm()
-    return torch.stack([first, torch.linalg.cross(normal, first)], dim=1)
+    x, y, z = plane[:3].tolist()  # in separate operations: every backend gives the same bits
+    sizes = [abs(x), abs(y), abs(z)]
+    across = ((0.0, z, -y), (-z, 0.0, x), (y, -x, 0.0))[sizes.index(min(sizes))]
+    length = math.sqrt((across[0] * across[0] + across[1] * across[1]) + across[2] * across[2])
+    u, v, w = (along / length for along in across)
+    axes = [[u, y * w - z * v], [v, z * u - x * w], [w, x * v - y * u]]
+    return uploaded(torch.tensor(axes, dtype=torch.float64, device="cpu"), plane.device)
 
 
 def over_hull(

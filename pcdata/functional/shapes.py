@@ -18,7 +18,7 @@ from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_count, checked_length
 from pcdata.errors import ConfigError, DTypeError
 from pcdata.functional.normals import estimate_normals
-from pcdata.functional.planes import checked_seeds, checked_tilt, checked_up
+from pcdata.functional.plane_arguments import checked_seeds, checked_tilt, checked_up
 from pcdata.functional.ransac import Limits, found_shapes
 from pcdata.functional.rows import cloud_of_rows, segment_max, segment_min
 from pcdata.geometry.shape_fit import CIRCLE, CYLINDER, LINE, ORIENTED_SPHERE, SPHERE, dot

@@ -19,7 +19,7 @@ from pcdata.functional.enclosed import enclosed_points
 from pcdata.functional.image_clusters import linked_pixels
 from pcdata.functional.image_grid import ImageGrid, checked_grid, is_lined
 from pcdata.functional.neighbors import knn
-from pcdata.functional.planes import fit_planes
+from pcdata.functional.plane_steps import fit_planes
 from pcdata.functional.rows import cloud_of_rows, pick_rows, ptr_after_mask
 from pcdata.functional.surface_fit import fit_surface, reaches
 

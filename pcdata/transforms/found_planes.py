@@ -12,13 +12,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pcdata.functional.plane_patch import flat_places, outline_rows
-from pcdata.functional.selection import plane_axes
+from pcdata.contracts.on_host import counts_of
 from pcdata.structures import PointCloud
 
 plane_guesses: ContextVar[tuple[Mapping[str, Any], ...]] = ContextVar("plane_guesses", default=())
 
-_MOST_CORNERS = 24  # of a stored hull: meta is written with every sample
 _DIGITS = 5  # of metres: a hundredth of a millimetre
 
 
@@ -65,73 +63,67 @@ def guessing_planes(planes: Sequence[Mapping[str, Any]]) -> Iterator[None]:
 def guessed_planes(cloud: PointCloud) -> Tensor:
     """Return the planes (B, 4) to begin the search of the next plane with, in the clouds' coordinates; NaN = none."""
     guesses = plane_guesses.get()
-    planes = torch.full((cloud.num_clouds, 4), torch.nan, dtype=torch.float64, device="cpu")
+    planes = np.full((cloud.num_clouds, 4), np.nan)
     for b in range(cloud.num_clouds):
         place = len(cloud.meta[b].get("planes", []))
         if place < len(guesses) and guesses[place]["frame"] == cloud.source_frame:
-            told = torch.tensor(
-                [*guesses[place]["normal"], guesses[place]["offset"]], dtype=torch.float64, device="cpu"
-            )
-            planes[b] = map_planes(told[None], cloud.source_from_cloud[b : b + 1].cpu())[0]
-    return planes
+            told = np.array([[*guesses[place]["normal"], guesses[place]["offset"]]])
+            planes[b] = _mapped(told, cloud.source_from_cloud[b : b + 1].cpu().numpy())
+    return torch.from_numpy(planes)
 
 
 def map_planes(planes: Tensor, old_from_new: Tensor) -> Tensor:
-    """Rewrite (P, 4) planes in new coordinates: a plane is a row vector, so it moves by the inverse matrix."""
-    moved = torch.einsum("pi,pij->pj", planes.double(), old_from_new)
-    return moved / moved[:, :3].norm(dim=1, keepdim=True)
+    """Rewrite (P, 4) planes in new coordinates, by (P, 4, 4) matrices on the CPU: a plane moves by the inverse one."""
+    return torch.from_numpy(_mapped(planes.double().numpy(), old_from_new.numpy()))
+
+
+def _mapped(planes: NDArray[np.float64], old_from_new: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Multiply planes, as row vectors, with matrices, and make their normals unit vectors again."""
+    moved: NDArray[np.float64] = (planes[:, :, None] * old_from_new).sum(1)
+    x, y, z = moved[:, 0], moved[:, 1], moved[:, 2]
+    return moved / np.sqrt(x * x + y * y + z * z)[:, None]
 
 
 def plane_facts(
-    points: Tensor,  # (n, 3) of the cloud
-    surface: Tensor,  # (n,) bool: the points of its surface
-    num_inliers: int,  # points near it, of walls that cross it too
-    plane: Tensor,  # (4,) in the cloud's coordinates
     cloud: PointCloud,
-    b: int,
-) -> dict[str, Any]:
-    """Return what is stored of one plane, in the source frame: itself, its share, its spread, and the hull of it."""
-    points, plane, source_from_cloud = points.detach(), plane.cpu(), cloud.source_from_cloud[b].cpu()
-    (source_plane,) = map_planes(plane[None], torch.linalg.inv(source_from_cloud)[None])
-    corners, rms = hull_corners(points, surface, plane)
-    moved = corners @ source_from_cloud[:3, :3].T + source_from_cloud[:3, 3]
-    return {
-        "normal": source_plane[:3].tolist(),
-        "offset": float(source_plane[3]),
-        "frame": cloud.source_frame,
-        "num_inliers": num_inliers,
-        "inlier_share": num_inliers / max(len(points), 1),
-        "rms": rms,
-        "hull": moved.numpy().round(_DIGITS).tolist(),
-    }
+    planes: NDArray[np.float64],  # (B, 4) in the clouds' coordinates
+    num_inliers: Tensor,  # (B,) points near each, of walls that cross it too
+    corners: Tensor,  # of their surfaces, (B, C) rows, -1 behind the last
+    rms: Tensor,  # (B,)
+) -> list[dict[str, Any]]:
+    """Return what is stored of each cloud's plane, in the source frame: itself, its share, its spread, and its hull."""
+    source_from_cloud = cloud.source_from_cloud.cpu().numpy()
+    source_planes = _mapped(planes, np.linalg.inv(source_from_cloud))
+    hulls = _hulls(cloud.points.detach(), planes, corners, source_from_cloud).round(_DIGITS).tolist()
+    num_corners = np.count_nonzero(corners.numpy() >= 0, axis=1).tolist()
+    counts, frame = counts_of(cloud.ptr), cloud.source_frame
+    return [
+        {
+            "normal": plane[:3],
+            "offset": plane[3],
+            "frame": frame,
+            "num_inliers": inliers,
+            "inlier_share": inliers / max(count, 1),
+            "rms": spread,
+            "hull": hull[:num],
+        }
+        for plane, inliers, count, spread, hull, num in zip(
+            source_planes.tolist(), num_inliers.tolist(), counts, rms.tolist(), hulls, num_corners
+        )
+    ]
 
 
-def hull_corners(points: Tensor, surface: Tensor, plane: Tensor) -> tuple[Tensor, float]:  # (C, 3) float64 on the CPU
-    """Return corners of the convex hull of points in a plane, moved onto it, without those that matter least.
-
-    And the RMS distance of the points from it.
-    """
-    axes = plane_axes(plane).T.contiguous()
-    rows, rms = outline_rows(points, surface, plane, axes)
-    corners = points[rows].double().cpu()
-    corners = corners[_most_corners(flat_places(corners, axes).numpy())]
-    return corners - (corners @ plane[:3] + plane[3])[:, None] * plane[:3], rms
-
-
-def _most_corners(corners: NDArray[np.float64]) -> list[int]:  # (C, 2), in order
-    """Say which corners stay: again and again the one goes whose triangle with its neighbors is smallest."""
-    kept = list(range(len(corners)))
-    places = corners.tolist()
-    sizes = [_corner_size(places, kept, at) for at in kept] if len(kept) > _MOST_CORNERS else []
-    while len(kept) > _MOST_CORNERS:
-        gone = sizes.index(min(sizes))
-        del kept[gone], sizes[gone]
-        for at in (gone - 1, gone % len(kept)):
-            sizes[at] = _corner_size(places, kept, at)
-    return kept
-
-
-def _corner_size(places: list[list[float]], kept: list[int], at: int) -> float:
-    """Return twice the area of the triangle of a corner and its neighbors."""
-    (left_x, left_y), (x, y), (right_x, right_y) = (places[kept[(at + step) % len(kept)]] for step in (-1, 0, 1))
-    return abs((left_x - x) * (right_y - y) - (left_y - y) * (right_x - x))
+def _hulls(
+    points: Tensor, planes: NDArray[np.float64], corners: Tensor, source_from_cloud: NDArray[np.float64]
+) -> NDArray[np.float64]:  # (B, C, 3)
+    """Return the corners moved onto the planes, in the source frame; anything where there is none."""
+    if not len(points):
+        return np.zeros((*corners.shape, 3))
+    if points.device.type == "cpu":
+        places = points.numpy()[corners.numpy()].astype(np.float64)
+    else:
+        places = points[corners.to(points.device)].cpu().double().numpy()
+    normals, offsets = planes[:, None, :3], planes[:, None, 3:]
+    flat = places - ((places * normals).sum(2, keepdims=True) + offsets) * normals
+    moved: NDArray[np.float64] = (flat[:, :, None, :] * source_from_cloud[:, None, :3, :3]).sum(3)
+    return moved + source_from_cloud[:, None, :3, 3]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, Literal
 
@@ -19,15 +19,16 @@ from pcdata.contracts.host import negated
 from pcdata.contracts.on_host import bounds_of, counts_of
 from pcdata.errors import ConfigError, PcdataWarning
 from pcdata.functional.fixed_rows import FixedRows, move_kept
-from pcdata.functional.largest_planes import words_drawn
-from pcdata.functional.plane_patch import plane_patch
+from pcdata.functional.largest_planes import largest_planes
 from pcdata.functional.plane_segments import supporting_plane
-from pcdata.functional.planes import near_planes, ransac_plane
+from pcdata.functional.plane_steps import near_planes
+from pcdata.functional.plane_surfaces import plane_surfaces
+from pcdata.functional.planes import ransac_plane
+from pcdata.functional.row_draws import words_drawn
 from pcdata.functional.rows import cloud_of_rows, count_per_cloud, kept_rows, ptr_after_mask
 from pcdata.functional.selection import over_hull
 from pcdata.functional.table_surface import table_surface
 from pcdata.geometry import rigid
-from pcdata.geometry.plane_fit import through_origin
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, METRE, PointCloud
 from pcdata.structures.read_later import MadeWhenRead, OfClouds
@@ -167,7 +168,7 @@ class RemovePlane(RemoveTransform):
         """Say which rows stay beside the points of each cloud's plane, by their height above it."""
         keep, kept_ptr, _ = kept_rows(own if gone is None else gone, data.ptr, gone=True)
         if self.keep != "both":
-            for b, plane in enumerate(planes.cpu()):
+            for b, plane in enumerate(planes.tolist()):
                 self._require_upper_side(data, b, plane)
             if height is None:
                 plane = planes.double()[cloud_of_rows(data.ptr)]
@@ -175,17 +176,15 @@ class RemovePlane(RemoveTransform):
                 keep &= height > 0
             if self.max_height is not None:
                 keep &= height <= self.max_height
-        parts = [slice(*pair) for pair in pairwise(bounds_of(data.ptr))]
-        patch = torch.cat(
-            [plane_patch(data.points[part], own[part], plane, self.distance) for part, plane in zip(parts, planes)]
-        )
+        points = data.points.detach()
+        patch, corners, rms = plane_surfaces(points, data.ptr, own, planes.cpu(), self.distance)
         if self.keep == "over":
-            keep &= torch.cat(
-                [
-                    over_hull(data.points[part], data.points[part][patch[part]], plane, self.margin)
-                    for part, plane in zip(parts, planes)
-                ]
-            )
+            parts = [slice(*pair) for pair in pairwise(bounds_of(data.ptr))]
+            over = [
+                over_hull(points[part], points[part][patch[part]], plane, self.margin)
+                for part, plane in zip(parts, planes)
+            ]
+            keep &= torch.cat(over)
         is_slab = gone is None and self.keep == "both"
         return {
             "index": keep,
@@ -193,6 +192,8 @@ class RemovePlane(RemoveTransform):
             "planes": planes,
             "num_inliers": data.counts - kept_ptr.diff() if is_slab else count_per_cloud(own, data.ptr),
             "per_point": patch,
+            "corners": corners,
+            "rms": rms,
         }
 
     def _found(self, data: PointCloud) -> tuple[Tensor, Tensor]:
@@ -224,12 +225,12 @@ class RemovePlane(RemoveTransform):
         planes = decided.values("planes", like=torch.empty(0, 4, dtype=torch.float64, device="cpu")).to(data.device)
         return self._apart(data, planes, near_planes(data.points, data.ptr, planes.cpu(), self.distance))
 
-    def _require_upper_side(self, data: PointCloud, b: int, plane: Tensor) -> None:
+    def _require_upper_side(self, data: PointCloud, b: int, plane: Sequence[float]) -> None:
         """Refuse a plane whose normal noise could turn round: it decides which half of the scene is dropped."""
         where = f"RemovePlane: keep={self.keep!r} of cloud {b}{sample_name(data, b)} is open: the plane"
         if self._faces(data, b, plane) == "neither side":
             raise ConfigError(
-                f"{where} passes the origin of {data.frame_id!r} at {1000 * abs(float(plane[3])):.3g} mm, nearer than "
+                f"{where} passes the origin of {data.frame_id!r} at {1000 * abs(plane[3]):.3g} mm, nearer than "
                 f"distance={self.distance:g}, so the origin is on neither side; say which way is up: "
                 f"up=(x, y, z), frame={data.frame_id!r}"
             )
@@ -241,18 +242,19 @@ class RemovePlane(RemoveTransform):
                     "give max_tilt to look for a level plane, or the up of this one"
                 )
 
-    def _tilt(self, plane: Tensor) -> float:
-        up = torch.tensor(self.up, dtype=torch.float64, device="cpu")
-        return float(rigid.angle_between(plane[:3].cpu(), up))
+    def _tilt(self, plane: Sequence[float]) -> float:
+        normal, up = (torch.tensor(given, dtype=torch.float64, device="cpu") for given in (plane[:3], self.up))
+        return float(rigid.angle_between(normal, up))
 
-    def _faces(self, data: PointCloud, b: int, plane: Tensor) -> str:
+    def _faces(self, data: PointCloud, b: int, plane: Sequence[float]) -> str:
         """Say what a normal was turned to."""
         if self.up is not None:
             return "up"
         seen_from = _viewpoints(data) if self.which == "supporting" else None
         if seen_from is None:
-            return "neither side" if through_origin(plane, self.distance) else "origin"
-        side = float(seen_from[b].double() @ plane[:3] + plane[3])
+            return "neither side" if abs(plane[3]) < self.distance else "origin"
+        x, y, z = seen_from[b].tolist()
+        side = ((x * plane[0] + y * plane[1]) + z * plane[2]) + plane[3]
         return "neither side" if abs(side) < self.distance else "sensor"
 
     @torch_on_one_thread()
@@ -263,7 +265,7 @@ class RemovePlane(RemoveTransform):
     def fixed_work(self, like: FixedRows) -> Callable[[FixedRows], FixedRows] | None:
         """Find the plane with the most inliers and remove the slab about it; whatever else is asked needs the host."""
         device = like.points.device
-        body = roomy_body("largest_planes", device)
+        body = roomy_body(largest_planes.__name__, device)
         is_plain = (self.which, self.cut, self.keep, self.up) == ("largest", "slab", "both", None)
         if body is None or not is_plain or like.normals is not None:
             return None
@@ -294,10 +296,9 @@ class RemovePlane(RemoveTransform):
     def _entries(self, data: PointCloud, params: Params) -> list[dict[str, Any]]:
         """Return what the meta of each cloud is told of its plane."""
         entries: list[dict[str, Any]] = []
-        for b, (start, stop) in enumerate(pairwise(bounds_of(data.ptr))):
-            plane = params["planes"][b]
-            inliers = int(params["num_inliers"][b])
-            found = plane_facts(data.points[start:stop], params["per_point"][start:stop], inliers, plane, data, b)
+        planes = params["planes"].detach().cpu().numpy()
+        facts = plane_facts(data, planes, params["num_inliers"], params["corners"], params["rms"])
+        for b, (found, plane) in enumerate(zip(facts, planes.tolist())):
             found["faces"] = self._faces(data, b, plane)
             for name in ("noise", "disparity_noise"):
                 if name in params and math.isfinite(value := float(params[name][b])):

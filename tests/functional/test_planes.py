@@ -9,8 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import ConfigError, DTypeError, NonFiniteError, NoPlaneError, ShapeError, TooFewPointsError
+from pcdata.functional import plane_steps
 from pcdata.functional import planes as planes_module
-from pcdata.functional.planes import draw_rows, ransac_plane
+from pcdata.functional.planes import ransac_plane
+from pcdata.functional.row_draws import draw_rows
 from pcdata.geometry.plane_fit import fit_plane, plane_distance, planes_through
 from pcdata.rng import seeded
 
@@ -86,11 +88,11 @@ def test_the_plane_is_the_least_squares_plane_of_its_own_inliers():
 
 
 def test_every_hypothesis_is_scored_on_every_point(monkeypatch):
-    monkeypatch.setattr(planes_module, "_PLANES", 3)
-    monkeypatch.setattr(planes_module, "_POINTS", 7)
+    monkeypatch.setattr(plane_steps, "_PLANES", 3)
+    monkeypatch.setattr(plane_steps, "_POINTS", 7)
     points = scene()
     hypotheses = planes_through(points[draw_rows(len(points), 3, 50, seeded(0))])
-    counts = planes_module._count_near(points, hypotheses, 0.01)
+    counts = plane_steps._count_near(points, hypotheses, 0.01)
     expected = (plane_distance(points, hypotheses).abs() < 0.01).sum(dim=1)
     assert torch.equal(counts, expected)
 
@@ -98,7 +100,7 @@ def test_every_hypothesis_is_scored_on_every_point(monkeypatch):
 def test_scoring_is_strict_too():
     points = torch.tensor([[0.0, 0, 0.25], [0, 0, -0.25], [0, 0, 0.125]])
     level = torch.tensor([[0.0, 0, 1, 0]], dtype=torch.float64)
-    assert planes_module._count_near(points, level, 0.25).tolist() == [1]
+    assert plane_steps._count_near(points, level, 0.25).tolist() == [1]
 
 
 def test_among_equal_hypotheses_the_earliest_wins():
@@ -106,7 +108,7 @@ def test_among_equal_hypotheses_the_earliest_wins():
     hypotheses = torch.tensor([[0.0, 0, 1, 0.4], [0.0, 0, 1, 0.501], [0.0, 0, 1, 0.499]], dtype=torch.float64)
     allowed = torch.ones(1, 3, dtype=torch.bool)
     ptr, none = torch.tensor([0, 50]), torch.zeros(1, dtype=torch.int64)
-    near = planes_module.record_planes(points, ptr, (), hypotheses[None], allowed, 0.01, none, backend="torch")
+    near = plane_steps.record_planes(points, ptr, (), hypotheses[None], allowed, 0.01, none, backend="torch")
     assert near.tolist() == [[0, 50, 0]]
     best = planes_module._best_planes(hypotheses[None], allowed, allowed, near, 0.01, 0)
     assert torch.equal(best, hypotheses[1:2])
@@ -155,7 +157,7 @@ def test_points_that_are_scored_are_spread_over_rows_and_columns():
     counts = torch.tensor([848 * 480, 5, 64 * 16_384])
     ptr = torch.cat([torch.zeros(1, dtype=torch.int64), counts.cumsum(0)])
     rows = torch.arange(int(ptr[-1]), dtype=torch.float64)[:, None].expand(-1, 3)
-    chosen, chosen_ptr = planes_module.spread_points(rows, ptr, 14)
+    chosen, chosen_ptr = plane_steps.spread_points(rows, ptr, 14)
     assert chosen_ptr.tolist() == [0, 16_384, 16_389, 32_773]
     assert bool((chosen[1:, 0] > chosen[:-1, 0]).all())
     for own, width in ((chosen[:16_384, 0], 848), (chosen[16_389:, 0] - float(ptr[2]), 64)):
@@ -166,7 +168,7 @@ def test_points_that_are_scored_are_spread_over_rows_and_columns():
 
 def test_a_plane_of_fewer_points_than_the_scored_ones_show_is_found_still():
     points = torch.rand((60_000, 3), generator=seeded(3))
-    some, _ = planes_module.spread_points(points, torch.tensor([0, 60_000]), 14)
+    some, _ = plane_steps.spread_points(points, torch.tensor([0, 60_000]), 14)
     hypotheses = planes_through(points[draw_rows(60_000, 3, 20, seeded(0))])
     assert int((plane_distance(some, hypotheses).abs() < 1e-7).sum(1).max()) < 3
     _, inliers = ransac_plane(points, distance=1e-7, probability=0.9, num_hypotheses=20)
@@ -175,7 +177,7 @@ def test_a_plane_of_fewer_points_than_the_scored_ones_show_is_found_still():
 
 def test_hypotheses_beyond_the_tilt_are_never_scored(monkeypatch):
     scored = []
-    monkeypatch.setattr(planes_module, "_count_near", lambda points, planes, distance: _kept(scored, points, planes))
+    monkeypatch.setattr(plane_steps, "_count_near", lambda points, planes, distance: _kept(scored, points, planes))
     up, limit = torch.tensor([0.0, 0, 1]), 0.3
     ransac_plane(scene(), num_hypotheses=200, up=up, max_tilt=limit, backend="torch")
     assert 0 < len(scored[0]) < 200

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, NoShapeError, ShapeError, TooFewPointsError
 from pcdata.functional import ransac
-from pcdata.functional.planes import draw_rows
+from pcdata.functional.row_draws import draw_rows
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.shapes import ransac_circle, ransac_cylinder, ransac_line, ransac_sphere
 from pcdata.rng import seeded

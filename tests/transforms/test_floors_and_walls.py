@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pcdata.functional import supporting_plane
-from pcdata.functional.plane_patch import plane_patch
+from pcdata.functional.plane_surfaces import plane_surfaces
 from pcdata.rng import seeded
 from pcdata.structures import PointCloud
 from pcdata.synthetic import tabletop
@@ -117,9 +117,9 @@ def test_the_hull_of_a_table_ends_where_the_table_does_and_not_along_the_wall(no
 def patch_of(*parts: Tensor, distance: float = 0.01) -> list[float]:
     """Share of each part near the plane z = 0 that is of its surface."""
     points = torch.cat(parts)
-    plane = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=torch.float64)
+    plane = torch.tensor([[0.0, 0.0, 1.0, 0.0]], dtype=torch.float64)
     near = points[:, 2].abs() < distance
-    patch = plane_patch(points, near, plane, distance)
+    patch, _, _ = plane_surfaces(points, torch.tensor([0, len(points)]), near, plane, distance)
     assert not bool((patch & ~near).any())
     sizes = [len(part) for part in parts]
     return [

@@ -12,6 +12,7 @@ from pcdata.kernels.cpu import lenses as cpu_lenses
 from pcdata.kernels.cpu import motions as cpu_motions
 from pcdata.kernels.cpu import neighbors as cpu_neighbors
 from pcdata.kernels.cpu import noise as cpu_noise
+from pcdata.kernels.cpu import planes as cpu_planes
 from pcdata.kernels.cpu import rendering as cpu_rendering
 from pcdata.kernels.cpu import rows as cpu_rows
 from pcdata.kernels.cpu import sampling as cpu_sampling
@@ -31,6 +32,7 @@ __all__ = [
     "cpu_motions",
     "cpu_neighbors",
     "cpu_noise",
+    "cpu_planes",
     "cpu_registration",
     "cpu_rendering",
     "cpu_rows",

@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0xE1EDD5EDC4AEDBD
+INTERFACE_NUMBER = 0x2C581A01EDE3E89
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -128,12 +128,11 @@ pc_near_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, flo
     distance, uint8* near
 pc_refine_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, double distance, double* up,
     double max_tilt, double flat, int64 rounds, double* planes, uint8* near
-pc_outline_points: float* points, uint8* chosen, int64 count, double* plane, double* axes, int64* rows, int64* num_rows,
-    double* squares
-pc_patch_cells: float* points, uint8* near, int64 count, double* plane, double* axes, double distance, int64* size,
-    double* numbers, uint8* cells
-pc_points_in_cells: float* points, uint8* chosen, int64 count, double* axes, double* low, double scale, uint8* cells,
-    int64 height, int64 width, uint8* inside
+pc_ransac_planes: float* points, int64* ptr, int64 num_clouds, int64* words, int64 num_draws, int64* which, double*
+    guess, double* up, double max_tilt, double distance, double missed, int64 bits, double flat, int64 rounds, double*
+    planes, uint8* near, int64* found
+pc_plane_surfaces: float* points, int64* ptr, int64 num_clouds, uint8* near, double* planes, double distance, int64
+    most_corners, uint8* patch, int64* corners, double* rms
 pc_moments: float* points, int64* ptr, int64 num_clouds, uint8* mask, double* centers, double* sums
 pc_reach: float* points, int64 rows, double* places, int64 num_places, double least, double* reach
 pc_fit_surface: float* points, int64 count, double* reach, double* plane, double* axes, double* numbers, double* height,

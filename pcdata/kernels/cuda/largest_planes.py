@@ -7,10 +7,12 @@ import math
 import torch
 from torch import Tensor
 
+import pcdata.functional.largest_planes  # noqa: F401 - the function must be registered before its kernel
 from pcdata.contracts.asked_later import constant
 from pcdata.contracts.dispatch import INNER, kernel
-from pcdata.functional.largest_planes import MOST_POINTS, words_drawn
-from pcdata.functional.planes import MAX_REFINEMENTS, SCORED_BITS, face_planes
+from pcdata.functional.plane_steps import MAX_REFINEMENTS
+from pcdata.functional.planes import SCORED_BITS, face_planes
+from pcdata.functional.row_draws import MOST_POINTS, words_drawn
 from pcdata.geometry.plane_fit import FLAT
 from pcdata.kernels.cuda.launching import launcher_of
 from pcdata.kernels.cuda.planes import SUMS, blocks_of_a_cloud

@@ -9,7 +9,7 @@ from torch import Tensor
 
 import pcdata.functional.planes  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, kernel
-from pcdata.functional.planes import MAX_REFINEMENTS, spread_points, tries_needed, within_tilt
+from pcdata.functional.plane_steps import MAX_REFINEMENTS, spread_points, tries_needed, within_tilt
 from pcdata.functional.rows import cloud_of_rows, counts_from_ptr
 from pcdata.geometry.plane_fit import plane_of_moments
 from pcdata.kernels.cuda.launching import BLOCK, Launcher, launcher_of

@@ -1,4 +1,4 @@
-"""The hull of many points by the compiled core: the corners of the reference, in its order."""
+"""Hulls and surfaces of many points by the compiled core: the corners of the reference, in its order."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from pcdata.contracts.dispatch import why_unavailable
-from pcdata.functional.plane_patch import outline_rows, patch_cells, points_in_cells
+from pcdata.functional.plane_surfaces import plane_surfaces
+from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.functional.selection import hull_rows, plane_axes
 from pcdata.rng import seeded
 
@@ -65,42 +66,55 @@ def _lifted(name):
     return points.float(), torch.rand(len(flat), generator=generator) < 0.7
 
 
+def assert_surfaces_equal(points, ptr, near, planes, distance):
+    ours, theirs = (plane_surfaces(points, ptr, near, planes, distance, backend=name) for name in ("cpu", "torch"))
+    assert torch.equal(ours[0], theirs[0])
+    assert torch.equal(ours[1], theirs[1])
+    torch.testing.assert_close(ours[2], theirs[2], rtol=1e-12, atol=0)
+    assert not bool((ours[0] & ~near).any())
+    return ours
+
+
 @pytest.mark.parametrize("name", SETS)
 def test_the_outline_is_that_of_the_reference(name):
     points, chosen = _lifted(name)
     for mask in (chosen, torch.zeros_like(chosen), torch.ones_like(chosen), torch.arange(len(chosen)) == 300):
-        ours, theirs = (outline_rows(points, mask, PLANE, AXES, backend=backend) for backend in ("cpu", "torch"))
-        assert torch.equal(ours[0], theirs[0])
-        assert ours[1] == pytest.approx(theirs[1], rel=1e-12)
+        assert_surfaces_equal(points, torch.tensor([0, len(points)]), mask, PLANE[None], 1e-3)
 
 
-@pytest.mark.parametrize("name", ["normal", "grid", "huge", "few"])
-@pytest.mark.parametrize("scale", [0.01, 3.7, 1e20])
-def test_cells_hold_the_points_of_the_reference(name, scale):
-    points, chosen = _lifted(name)
-    cells, low = torch.rand(9, 7, generator=seeded(6)) < 0.5, torch.tensor([-0.5, -1.25], dtype=torch.float64)
-    found = [points_in_cells(points, chosen, AXES, low, scale, cells, backend=backend) for backend in ("cpu", "torch")]
-    assert torch.equal(*found)
-    assert not bool((found[0] & ~chosen).any())
-    assert not len(points_in_cells(points[:0], chosen[:0], AXES, low, scale, cells, backend="cpu"))
-
-
+@pytest.mark.parametrize("threads", [1, 5])
 @pytest.mark.parametrize("name", SETS)
 @pytest.mark.parametrize("distance", [1e-3, 0.05, 30.0])
-def test_the_cells_of_a_surface_are_those_of_the_reference(name, distance):
+def test_surfaces_of_large_and_small_clouds_are_those_of_the_reference(name, distance, threads, monkeypatch):
+    monkeypatch.setattr("pcdata.kernels.cpu.native.core_threads", lambda: threads)
     points, _ = _lifted(name)
     points = torch.cat([points, points[:, [0, 2, 1]], points.flip(0) * 0.5 + 0.01]).repeat(3, 1)  # 45,000, and walls
-    for some, offset in ((points, 0.0), (points[:700], 0.01), (points[:0], 0.0)):
-        near = (some.double() @ PLANE[:3] + offset).abs() < distance
-        plane = torch.cat([PLANE[:3], torch.tensor([offset], dtype=torch.float64)])
-        for mask in (near, torch.zeros_like(near)):
-            ours, theirs = (
-                patch_cells(some, mask, plane, AXES, distance, backend=backend) for backend in ("cpu", "torch")
-            )
-            assert torch.equal(ours[0], theirs[0])
-            assert ours[1] == theirs[1]
-            assert torch.equal(ours[2], theirs[2])
-            assert bool(ours[2].any()) == bool(mask[:: max(1, len(mask) // 16384)].any())
+    counts = [len(points), 700, 0, 3, min(8193, len(points))]
+    points = torch.cat([points[:count] for count in counts])
+    ptr = ptr_from_counts(counts)
+    planes = PLANE.repeat(len(counts), 1)
+    planes[1:, 3] = 0.01
+    own = planes[cloud_of_rows(ptr)]
+    near = ((points.double() * own[:, :3]).sum(1) + own[:, 3]).abs() < distance
+    for mask in (near, torch.zeros_like(near)):
+        patch, _, _ = assert_surfaces_equal(points, ptr, mask, planes, distance)
+        assert bool(patch.any()) == bool(mask.any())
+
+
+def test_corners_that_matter_least_are_left_out():
+    """Of a circle of many points 24 stay, which are spread about it; of few all do, in their order."""
+    turn = torch.linspace(0, 2 * torch.pi, 721, dtype=torch.float64)[:-1]
+    ring = torch.stack([turn.cos(), turn.sin(), torch.zeros(720)], 1).float()
+    plane, near = torch.tensor([[0.0, 0.0, 1.0, 0.0]], dtype=torch.float64), torch.ones(720, dtype=torch.bool)
+    for step, left in ((1, 24), (30, 24), (40, 18)):
+        some = ring[::step].contiguous()
+        ptr = torch.tensor([0, len(some)])
+        _, corners, rms = assert_surfaces_equal(some, ptr, near[: len(some)], plane, 0.05)
+        kept = corners[0][corners[0] >= 0]
+        assert len(kept) == left
+        assert float(rms) == 0
+        gaps = (turn[::step][kept].roll(-1) - turn[::step][kept]) % (2 * torch.pi)
+        assert float(gaps.max()) < 2.1 * float(gaps.min())
 
 
 def test_a_small_patch_and_a_wall_are_no_surface():
@@ -109,10 +123,9 @@ def test_a_small_patch_and_a_wall_are_no_surface():
     stray = torch.rand(60, 3, generator=generator) * torch.tensor([0.1, 0.1, 0.0]) + torch.tensor([1.5, 0.5, 0.0])
     wall = torch.rand(6000, 3, generator=generator) * torch.tensor([0.02, 1.0, 0.8]) + torch.tensor([1.1, 0.0, -0.4])
     points = torch.cat([table, stray, wall])
-    plane = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=torch.float64)
-    near, axes = points[:, 2].abs() < 0.01, plane_axes(plane).T.contiguous()
-    for backend in ("cpu", "torch"):
-        low, scale, cells = patch_cells(points, near, plane, axes, 0.01, backend=backend)
-        found = points_in_cells(points, near, axes, low, scale, cells, backend=backend)
-        assert bool(found[:9000].all())
-        assert not bool(found[9000:].any())
+    plane = torch.tensor([[0.0, 0.0, 1.0, 0.0]], dtype=torch.float64)
+    near = points[:, 2].abs() < 0.01
+    patch, corners, _ = assert_surfaces_equal(points, torch.tensor([0, len(points)]), near, plane, 0.01)
+    assert bool(patch[:9000].all())
+    assert not bool(patch[9000:].any())
+    assert int(corners.max()) < 9000

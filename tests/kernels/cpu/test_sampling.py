@@ -20,7 +20,8 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import why_unavailable
 from pcdata.functional.depth.deproject import deproject_depth
-from pcdata.functional.planes import draw_rows, ransac_plane
+from pcdata.functional.planes import _draw_triples, ransac_plane
+from pcdata.functional.row_draws import draw_rows
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.sampling import farthest_point_sample
 from pcdata.functional.voxels import find_voxel_size, voxel_downsample
@@ -280,10 +281,10 @@ def test_planes_of_small_clouds_equal_the_reference(count, seed, num_hypotheses,
 
 
 def test_inlier_counts_equal_the_reference():
-    from pcdata.functional import planes
+    from pcdata.functional import plane_steps as planes
 
     points, ptr = organized(100, 101), torch.tensor([0, 4000, 4003, 10100])
-    triples, which = planes._draw_triples([4000, 3, 6097], 77, [0, 1, 2])
+    triples, which = _draw_triples([4000, 3, 6097], 77, [0, 1, 2])
     drawn = [planes.draw_planes(points, ptr, triples, which, backend=name) for name in ("cpu", "torch")]
     torch.testing.assert_close(*drawn, rtol=0, atol=1e-12, equal_nan=True)
     competes, floors = ~drawn[1][..., 0].isnan(), torch.tensor([0, 0, 40])
@@ -293,7 +294,7 @@ def test_inlier_counts_equal_the_reference():
 def assert_records_equal(
     points: Tensor, ptr: Tensor, drawn: Tensor, competes: Tensor, distance: float, floors: Tensor
 ) -> None:
-    from pcdata.functional import planes
+    from pcdata.functional import plane_steps as planes
 
     found = []
     for name in ("cpu", "torch"):
@@ -332,7 +333,7 @@ def test_runs_of_points_change_no_count(order, scale, machine):
 @pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1e-6, 0.0), (1e16, 0.0), (1.0, 3e4)])
 def test_many_planes_close_to_the_best_are_counted_as_the_reference_does(order, scale, offset, machine):
     """Most of many planes are told from the best by offsets from it: of a rough table, a wall and points about."""
-    from pcdata.functional import planes
+    from pcdata.functional import plane_steps as planes
 
     generator = seeded(4)
     u, v = torch.meshgrid(torch.linspace(-0.6, 0.6, 240), torch.linspace(-0.4, 0.4, 160), indexing="ij")
@@ -360,7 +361,7 @@ def test_many_planes_close_to_the_best_are_counted_as_the_reference_does(order, 
 @pytest.mark.parametrize("probability", [0.2, 0.9, 1 - 1e-15])
 @pytest.mark.parametrize("not_drawn", [0, 1])
 def test_a_search_that_may_stop_equals_the_reference(probability, not_drawn, machine):
-    from pcdata.functional import planes
+    from pcdata.functional import plane_steps as planes
 
     points = torch.cat([organized(130, 170), organized(90, 100), organized(20, 30)]).contiguous()
     ptr = ptr_from_counts([22_100, 9_000, 0, 600])
@@ -377,7 +378,7 @@ def test_a_search_that_may_stop_equals_the_reference(probability, not_drawn, mac
 @pytest.mark.parametrize("order", ["image", "shuffled", "sorted", "line"])
 def test_refinement_equals_the_reference(order, machine):
     """Of large and small clouds, whatever their order says of the points."""
-    from pcdata.functional import planes
+    from pcdata.functional import plane_steps as planes
 
     points, generator = organized(130, 170), seeded(2)
     if order == "shuffled":

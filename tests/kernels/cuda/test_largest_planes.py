@@ -6,9 +6,10 @@ import pytest
 import torch
 
 from pcdata.contracts import dispatch
-from pcdata.functional import largest_planes as module
-from pcdata.functional.largest_planes import largest_planes, words_drawn
-from pcdata.functional.planes import draw_rows, ransac_plane
+from pcdata.functional import row_draws as module
+from pcdata.functional.largest_planes import largest_planes
+from pcdata.functional.planes import ransac_plane
+from pcdata.functional.row_draws import draw_rows, words_drawn
 from pcdata.rng import seeded
 from tests.kernels.cuda import harness
 

@@ -514,26 +514,25 @@ PC_EXPORT int32_t pc_refine_planes(const pc_context* context, const float* point
                                    const double* up, double max_tilt, double flat, int64_t rounds, double* planes,
                                    uint8_t* near);
 
-// points (count, 3), chosen (count,) of 0 and 1, a plane (4,) and its axes (2, 3) -> rows (count,), the first num_rows
-// (1) rising: chosen points among which all corners of their convex hull in the plane are; squares (1): the sum of the
-// squared distances of all chosen points from the plane.
-PC_EXPORT int32_t pc_outline_points(const pc_context* context, const float* points, const uint8_t* chosen,
-                                    int64_t count, const double* plane, const double* axes, int64_t* rows,
-                                    int64_t* num_rows, double* squares);
+// points (N, 3), ptr (num_clouds+1,) of clouds of three points or more, words (T, 3, num_draws) of 32 bits, which
+// (num_clouds,) of the T each cloud takes, planes to try before those (num_clouds, 4) or null, unit vectors
+// (num_clouds, 3) or null, max_tilt from them or -1, missed = log(1 - probability) or 0, 2^bits points of a cloud to
+// count on if that is not 0, and the rounds of pc_refine_planes -> planes (num_clouds, 4) and near (N,) as ransac_plane
+// describes them; found (num_clouds, 3): of what is tried how many are planes and how many of those compete, 0 unless
+// fewer than 3 points are near the best; and how many points are.
+PC_EXPORT int32_t pc_ransac_planes(const pc_context* context, const float* points, const int64_t* ptr,
+                                   int64_t num_clouds, const int64_t* words, int64_t num_draws, const int64_t* which,
+                                   const double* guess, const double* up, double max_tilt, double distance,
+                                   double missed, int64_t bits, double flat, int64_t rounds, double* planes,
+                                   uint8_t* near, int64_t* found);
 
-// points (count, 3), near (count,) of 0 and 1, a plane (4,) and its axes (2, 3) -> size (2,): the rows and columns of
-// cells (at most 512, 512), of 0 and 1, which patch_cells marks; numbers (3,): where they begin and how many there are
-// to a unit. No rows, and zeros, where nothing that is looked at is near; -1 rows where places are too far away to be
-// numbered.
-PC_EXPORT int32_t pc_patch_cells(const pc_context* context, const float* points, const uint8_t* near, int64_t count,
-                                 const double* plane, const double* axes, double distance, int64_t* size,
-                                 double* numbers, uint8_t* cells);
-
-// points (count, 3), chosen (count,) of 0 and 1, axes (2, 3) of a plane, low (2,) and cells to a unit, cells (height,
-// width) of 0 and 1, as plane_patch numbers them -> inside (count,): whether a point is chosen and in a cell that is.
-PC_EXPORT int32_t pc_points_in_cells(const pc_context* context, const float* points, const uint8_t* chosen,
-                                     int64_t count, const double* axes, const double* low, double scale,
-                                     const uint8_t* cells, int64_t height, int64_t width, uint8_t* inside);
+// points (N, 3), ptr (num_clouds+1,), near (N,) of 0 and 1, planes (num_clouds, 4) -> patch (N,): the points near its
+// plane that are of each surface; corners (num_clouds, most_corners): rows of these, -1 behind the last; rms
+// (num_clouds,): as plane_surfaces describes them. The rms is -1, and nothing else is written, where places are too far
+// away to be numbered.
+PC_EXPORT int32_t pc_plane_surfaces(const pc_context* context, const float* points, const int64_t* ptr,
+                                    int64_t num_clouds, const uint8_t* near, const double* planes, double distance,
+                                    int64_t most_corners, uint8_t* patch, int64_t* corners, double* rms);
 
 // points (N, 3), ptr (num_clouds+1,), mask (N,) of 0 and 1, centers (num_clouds, 3) -> sums (num_clouds, 11) over the
 // chosen points of each cloud, with p their offsets from its center: count, largest absolute coordinate, x, y, z, xx,

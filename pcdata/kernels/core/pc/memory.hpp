@@ -15,6 +15,8 @@ namespace pc {
 // them. One arena per thread; a call takes slices of it and gives all back at its end (ScratchFrame).
 class Arena {
  public:
+  int num_frames = 0;  // that are open
+
   static Arena& mine() {
     static thread_local Arena arena;
     return arena;
@@ -28,6 +30,14 @@ class Arena {
     used_ += bytes;
     total_ += bytes;
     return result;
+  }
+  // How much is taken, to give back what is taken later.
+  struct Mark {
+    size_t blocks, used;
+  };
+  Mark mark() const { return {blocks_.size(), used_}; }
+  void give_back(const Mark& mark) {
+    if (blocks_.size() == mark.blocks) used_ = mark.used;
   }
   void reset() {
     // Next time one block holds what this call needed in several; a giant call's memory is not kept.
@@ -61,13 +71,19 @@ class Arena {
   size_t total_ = 0;
 };
 
-// Gives the arena back when a kernel ends, however it ends. Kernels do not call one another.
+// Gives the arena back when a kernel ends, however it ends; a frame within another gives back what it took itself.
 struct ScratchFrame {
   Arena& arena = Arena::mine();
-  ScratchFrame() = default;
+  Arena::Mark before = arena.mark();
+  ScratchFrame() { ++arena.num_frames; }
   ScratchFrame(const ScratchFrame&) = delete;
   ScratchFrame& operator=(const ScratchFrame&) = delete;
-  ~ScratchFrame() { arena.reset(); }
+  ~ScratchFrame() {
+    if (--arena.num_frames == 0)
+      arena.reset();
+    else
+      arena.give_back(before);
+  }
   template <class T>
   T* take(int64_t count) {
     return arena.take<T>(count);

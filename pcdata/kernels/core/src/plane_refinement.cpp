@@ -1,123 +1,6 @@
-// Refitting planes to the points near them until those no longer change.
-#include "pc/math/eigen.hpp"
-#include "pc/planes/followed_points.hpp"
-
-namespace pc::planes {
-namespace {
-
-// Points; such clouds are refined side by side, each by one thread: they are one piece of every loop within.
-constexpr int64_t kSmallCloud = 8192;
-
-struct Rules {
-  float distance;
-  double flat, max_tilt;
-  int64_t rounds;
-};
-
-Plane rounded(const double* plane) {
-  return {static_cast<float>(plane[0]), static_cast<float>(plane[1]), static_cast<float>(plane[2]),
-          static_cast<float>(plane[3])};
-}
-
-bool is_within_tilt(const double* plane, const double* up, double max_tilt) {
-  if (up == nullptr) return true;
-  constexpr double kHalfTurn = 3.14159265358979323846;
-  const math::Vector3 normal{plane[0], plane[1], plane[2]}, along{up[0], up[1], up[2]};
-  const double angle = std::atan2(fused_length(cross(normal, along)), dot(normal, along));
-  return std::min(angle, kHalfTurn - angle) <= max_tilt;
-}
-
-// Refines the plane of one cloud.
-class Refinement {
- public:
-  Refinement(const pc_context& context, const Runs& runs, const Rules& rules, const double* up)
-      : context_(context), runs_(runs), rules_(rules), up_(up) {}
-
-  void run(double* plane, uint8_t* near, ScratchFrame& scratch) const {
-    Plane now = rounded(plane);
-    const int64_t first = first_near(now);
-    if (first < 0) {
-      std::fill_n(near, runs_.num_points, uint8_t{0});
-      return;
-    }
-    // Offsets from a point of the plane are no longer than the plane is wide, so their squares keep their digits.
-    const math::Vector3 center = math::vector_of(runs_.points + 3 * first);
-    const double about[3] = {center.x, center.y, center.z};
-    FollowedPoints followed(context_, runs_, rules_.distance, about, scratch);
-    followed.start(now);
-    for (int64_t round = 0; round < rules_.rounds; ++round) {
-      double fitted[4];
-      if (!fit(followed, about, fitted) || !is_within_tilt(fitted, up_, rules_.max_tilt)) break;
-      const Plane next = rounded(fitted);
-      const bool changed = followed.move(now, next);
-      if (followed.sums().values[0] < 3) {
-        followed.start(now);
-        break;
-      }
-      std::copy_n(fitted, 4, plane);
-      now = next;
-      if (!changed) break;
-    }
-    write(followed, near);
-  }
-
- private:
-  int64_t first_near(const Plane& plane) const {
-    const RunTest test(plane, rules_.distance);
-    for (int64_t i = 0; i < runs_.count; i += kLanes)
-      for (uint32_t open = test(runs_, i).open.bits(); open != 0; open &= open - 1) {
-        const int64_t begin = kRun * (i + __builtin_ctz(open)), end = std::min(begin + kRun, runs_.num_points);
-        for (int64_t k = begin; k < end; ++k)
-          if (plane.is_near(runs_.points + 3 * k, rules_.distance)) return k;
-      }
-    return -1;
-  }
-
-  // False where the points are fewer than three, or lie on a line.
-  bool fit(const FollowedPoints& followed, const double* about, double* plane) const {
-    const math::Moments moments = followed.sums().moments();
-    if (moments.count < 3) return false;
-    const math::LeastVarying found = least_varying(covariance(moments));
-    const double width = std::sqrt(std::max(found.next, 0.0));
-    if (width <= rules_.flat * static_cast<double>(followed.largest()) &&
-        width <= rules_.flat * largest_coordinate(followed))
-      return false;
-    const math::Vector3& n = found.direction;
-    const double x = n.x * (about[0] + moments.x / moments.count), y = n.y * (about[1] + moments.y / moments.count),
-                 z = n.z * (about[2] + moments.z / moments.count);
-    plane[0] = n.x, plane[1] = n.y, plane[2] = n.z;
-    plane[3] = -((x + z) + y);
-    return true;
-  }
-
-  // Of the points that are near.
-  double largest_coordinate(const FollowedPoints& followed) const {
-    float largest = 0;
-    for (int64_t run = 0; run < runs_.count; ++run)
-      for (uint64_t bits = followed.near(run); bits != 0; bits &= bits - 1) {
-        const float* p = runs_.points + 3 * (kRun * run + __builtin_ctzll(bits));
-        for (int axis = 0; axis < 3; ++axis) largest = std::max(largest, std::fabs(p[axis]));
-      }
-    return largest;
-  }
-
-  void write(const FollowedPoints& followed, uint8_t* near) const {
-    parallel_for(context_, (runs_.num_points + kRun - 1) / kRun, 1024, [&](int64_t begin, int64_t end, int64_t) {
-      for (int64_t run = begin; run < end; ++run) {
-        const auto size = static_cast<int>(std::min<int64_t>(kRun, runs_.num_points - kRun * run));
-        spread_bits(followed.near(run), size, near + kRun * run);
-      }
-    });
-  }
-
-  const pc_context& context_;
-  const Runs& runs_;
-  const Rules& rules_;
-  const double* up_;
-};
-
-}  // namespace
-}  // namespace pc::planes
+// Refitting planes to the points near them; for batches of clouds.
+#include "pc/planes/clouds.hpp"
+#include "pc/planes/refinement.hpp"
 
 PC_EXPORT int32_t pc_refine_planes(const pc_context* context, const float* points, const int64_t* ptr,
                                    int64_t num_clouds, const int64_t* run_ptr, const float* runs, double distance,
@@ -126,8 +9,8 @@ PC_EXPORT int32_t pc_refine_planes(const pc_context* context, const float* point
   using namespace pc;
   using namespace pc::planes;
   return guarded([&] {
-    const Rules rules{static_cast<float>(distance), flat, max_tilt, rounds};
-    const auto refine = [&](int64_t cloud) {
+    const RefinementRules rules{static_cast<float>(distance), flat, max_tilt, rounds};
+    const auto refine = [&](const pc_context& own_context, int64_t cloud) {
       ScratchFrame scratch;
       const Range rows{ptr[cloud], ptr[cloud + 1]};
       Range own = run_ptr == nullptr ? Range{0, 0} : Range{run_ptr[cloud], run_ptr[cloud + 1]};
@@ -142,15 +25,9 @@ PC_EXPORT int32_t pc_refine_planes(const pc_context* context, const float* point
         facts = mine;
       }
       const Runs known(facts, stride, own, points, rows);
-      Refinement(*context, known, rules, up == nullptr ? nullptr : up + 3 * cloud)
+      Refinement(own_context, known, rules, up == nullptr ? nullptr : up + 3 * cloud)
           .run(planes + 4 * cloud, near + rows.begin, scratch);
     };
-    const auto is_small = [&](int64_t cloud) { return ptr[cloud + 1] - ptr[cloud] <= kSmallCloud; };
-    parallel_for(*context, num_clouds, 16, [&](int64_t begin, int64_t end, int64_t) {
-      for (int64_t cloud = begin; cloud < end; ++cloud)
-        if (is_small(cloud)) refine(cloud);
-    });
-    for (int64_t cloud = 0; cloud < num_clouds; ++cloud)
-      if (!is_small(cloud)) refine(cloud);
+    for_each_cloud(*context, ptr, num_clouds, 16, refine);
   });
 }

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import REFERENCE, inner
+from pcdata.contracts.on_host import bounds_of
 from pcdata.functional.image_clusters import lowest_rows
 from pcdata.functional.selection import hull_rows, plane_axes
 
+MOST_CORNERS = 24  # of a hull: it is written with every sample
 _MOST_POINTS = 1 << 14  # that tell where the surface is
 _REACH = 5  # distances from the plane that tell whether something crosses it
 _MOST_CELLS = 500  # along a side: a stray far away needs no more
@@ -19,35 +23,52 @@ _SHARE_BITS = 30
 _SMALLER = 10  # times: parts of a table behind what stands on it, and no strays at its height
 
 
-def plane_patch(
-    points: Tensor,  # (n, 3)
-    near: Tensor,  # (n,) bool: the points near the plane
-    plane: Tensor,  # (4,) float64
+@inner
+def plane_surfaces(
+    points: Tensor,  # (N, 3) float32
+    ptr: Tensor,  # (B+1,)
+    near: Tensor,  # (N,) bool: the points near their cloud's plane
+    planes: Tensor,  # (B, 4) float64 on the CPU
     distance: float,
-) -> Tensor:  # (n,) bool
-    """Mark those of the points near a plane that are of its surface, rather than of walls and things it crosses.
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor, Tensor]:  # patch (N,) bool; corners (B, 24) int64 and rms (B,) float64, on the CPU
+    """Mark those of the points near each plane that are of its surface, rather than of walls and things it crosses.
 
     In square cells of the plane, a surface has its points near the plane, and what crosses it has most of them above
     and below. Cells where points near the plane are less than half as frequent, among those within 5 distances, as
     they are on average are left out; of the others, the connected patches that are a tenth as large as the largest
     are kept. Cells have an edge of 4 distances, doubled until a fifth at most holds one point alone.
+
+    The corners are rows of points of the surface, those of its convex hull in the plane, counterclockwise as seen from
+    where the normal points to, and -1 behind the last; where there are more than 24, those that matter least are left
+    out. The third result is the RMS distance of the points of the surface from the plane, 0 where there are none.
     """
-    points, plane = points.detach(), plane.detach().double().cpu()
-    axes = plane_axes(plane).T.contiguous()
-    low, scale, cells = patch_cells(points, near, plane, axes, distance)
-    return points_in_cells(points, near, axes, low, scale, cells) if len(cells) else near
+    patches, corners, rms = [], [], []
+    for (start, stop), plane in zip(pairwise(bounds_of(ptr)), planes):
+        own, axes = points[start:stop], plane_axes(plane).T.contiguous()
+        patches.append(_patch(own, near[start:stop], plane, axes, distance))
+        rows, spread = _outline(own, patches[-1], plane, axes)
+        corners.append((rows + start).tolist() + [-1] * (MOST_CORNERS - len(rows)))
+        rms.append(spread)
+    return (
+        torch.cat(patches),
+        torch.tensor(corners, dtype=torch.int64, device="cpu").reshape(-1, MOST_CORNERS),
+        torch.tensor(rms, dtype=torch.float64, device="cpu"),
+    )
 
 
-@inner
-def patch_cells(
-    points: Tensor,  # (n, 3) float32
-    near: Tensor,  # (n,) bool
-    plane: Tensor,  # (4,) float64 on the CPU
-    axes: Tensor,  # (2, 3) float64 on the CPU: of the plane
-    distance: float,
-    *,
-    backend: str = "auto",
-) -> tuple[Tensor, float, Tensor]:  # low (2,) float64 on the CPU, cells to a unit, (rows, columns) bool
+def _patch(points: Tensor, near: Tensor, plane: Tensor, axes: Tensor, distance: float) -> Tensor:  # (n,) bool
+    """Mark the points near a plane that are of its surface."""
+    low, scale, cells = _surface_cells(points, near, plane, axes, distance)
+    if not len(cells):
+        return near
+    return near & cells.reshape(-1)[_cells(_flat(points, axes), low, scale, list(cells.shape))]
+
+
+def _surface_cells(
+    points: Tensor, near: Tensor, plane: Tensor, axes: Tensor, distance: float
+) -> tuple[Tensor, float, Tensor]:  # low (2,), cells to a unit, (rows, columns) bool
     """Mark the cells of the surface, and say where cells begin; none at all where no point looked at is near."""
     stride = max(1, len(points) // _MOST_POINTS)
     own, some = near[::stride], points[::stride]
@@ -78,41 +99,35 @@ def patch_cells(
     return low.double().cpu(), 1 / edge, kept
 
 
-@inner
-def points_in_cells(
-    points: Tensor,  # (n, 3) float32
-    chosen: Tensor,  # (n,) bool
-    axes: Tensor,  # (2, 3) float64 on the CPU: of the plane
-    low: Tensor,  # (2,) float64 on the CPU: where cells begin
-    scale: float,  # cells to a unit
-    cells: Tensor,  # (rows, columns) bool
-    *,
-    backend: str = "auto",
-) -> Tensor:  # (n,) bool
-    """Mark the chosen points that lie in marked cells."""
-    return chosen & cells.reshape(-1)[_cells(_flat(points, axes), low, scale, list(cells.shape))]
-
-
-@inner
-def outline_rows(
-    points: Tensor,  # (n, 3) float32
-    chosen: Tensor,  # (n,) bool
-    plane: Tensor,  # (4,) float64 on the CPU
-    axes: Tensor,  # (2, 3) float64 on the CPU: of the plane
-    *,
-    backend: str = "auto",
-) -> tuple[Tensor, float]:
-    """Return the rows (C,) of the corners of the chosen points' convex hull in a plane, and their RMS distance from it.
-
-    The corners are counterclockwise as seen from where the normal points to; the distance of no points is 0.
-    """
+def _outline(points: Tensor, chosen: Tensor, plane: Tensor, axes: Tensor) -> tuple[Tensor, float]:
+    """Return the rows of corners of the chosen points, and the RMS distance of these from the plane."""
     rows = chosen.nonzero().squeeze(1)
     own = points[rows].double()
-    corners = rows[hull_rows(flat_places(own, axes), backend=REFERENCE)]
+    places = flat_places(own, axes)
+    hull = hull_rows(places, backend=REFERENCE)
+    kept = _most_corners(places[hull].tolist())
     x, y, z = own.unbind(1)
     a, b, c, d = plane.tolist()
     off = ((x * a + y * b) + z * c) + d
-    return corners, float(off.square().mean().sqrt()) if len(own) else 0.0
+    return rows[hull].cpu()[kept], float(off.square().mean().sqrt()) if len(own) else 0.0
+
+
+def _most_corners(places: list[list[float]]) -> list[int]:
+    """Say which corners stay: again and again the one goes whose triangle with its neighbors is smallest."""
+    kept = list(range(len(places)))
+    sizes = [_corner_size(places, kept, at) for at in kept] if len(kept) > MOST_CORNERS else []
+    while len(kept) > MOST_CORNERS:
+        gone = sizes.index(min(sizes))
+        del kept[gone], sizes[gone]
+        for at in (gone - 1, gone % len(kept)):
+            sizes[at] = _corner_size(places, kept, at)
+    return kept
+
+
+def _corner_size(places: list[list[float]], kept: list[int], at: int) -> float:
+    """Return twice the area of the triangle of a corner and its neighbors."""
+    (left_x, left_y), (x, y), (right_x, right_y) = (places[kept[(at + step) % len(kept)]] for step in (-1, 0, 1))
+    return abs((left_x - x) * (right_y - y) - (left_y - y) * (right_x - x))
 
 
 def flat_places(points: Tensor, axes: Tensor) -> Tensor:  # (n, 2) float64
