@@ -19,6 +19,8 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from pcdata.contracts.dispatch import why_unavailable
+from pcdata.errors import NoPlaneError
+from pcdata.functional import row_draws
 from pcdata.functional.depth.deproject import deproject_depth
 from pcdata.functional.planes import _draw_triples, ransac_plane
 from pcdata.functional.row_draws import draw_rows
@@ -27,6 +29,7 @@ from pcdata.functional.sampling import farthest_point_sample
 from pcdata.functional.voxels import find_voxel_size, voxel_downsample
 from pcdata.geometry.plane_fit import planes_through
 from pcdata.kernels.cpu import native
+from pcdata.kernels.cpu import planes as cpu_planes
 from pcdata.rng import seeded
 
 REASON = why_unavailable("cpu")
@@ -278,6 +281,49 @@ def test_planes_of_small_clouds_equal_the_reference(count, seed, num_hypotheses,
     assert_planes_equal_to_reference(
         points, None, distance=0.03 * scale, num_hypotheses=num_hypotheses, seed=seed, up=(0, 0.1, 1), max_tilt=0.5
     )
+
+
+@pytest.mark.parametrize("probability", [None, 0.99])
+@pytest.mark.parametrize("seeds", [3, [5, 2**40, 5, 0], list(range(4))])
+def test_all_of_a_search_equals_the_reference(probability, seeds, monkeypatch):
+    """Of large and small clouds, with guesses, a direction, and whatever way words come."""
+    points = torch.cat([organized(130, 170), organized(90, 100), organized(20, 30), organized(3, 3)]).contiguous()
+    counts = [22_100, 9_000, 600, 9]
+    ptr = ptr_from_counts(counts)
+    guess = torch.tensor([[0.0, 0.0, 2.0, -1.0], [torch.nan] * 4, [0.0, 1.0, 0.1, 0.2], [1.0, 0.0, 0.0, 9.0]])
+    up = torch.tensor([[0.0, 0.0, -1.0], [0.3, 0.0, -1.0], [0.0, 0.2, 1.0], [0.0, 0.0, 2.0]])
+    search = {"distance": 0.02, "num_hypotheses": 70, "seed": seeds, "probability": probability}
+    for more in ({}, {"guess": guess}, {"up": up, "max_tilt": 0.7, "guess": guess}, {"up": up}):
+        case = probability, str(seeds), tuple(more)
+        assert_planes_equal_to_reference(points, ptr, case=case, **search, **more)
+    found = ransac_plane(points, ptr, backend="cpu", **search)
+    for pretended in ("words_drawn", "_KEPT"):  # a torch that draws otherwise, and more seeds than are kept
+        monkeypatch.setattr(row_draws, pretended, 0 if pretended == "_KEPT" else lambda *asked: None)
+        again = ransac_plane(points, ptr, backend="cpu", **search)
+        assert all(torch.equal(*pair) for pair in zip(found, again, strict=True))
+    monkeypatch.setattr(cpu_planes, "MOST_HYPOTHESES", 100)
+    monkeypatch.setattr("pcdata.kernels.cpu.native.core_threads", lambda: 3)
+    again = ransac_plane(points, ptr, backend="cpu", **search)
+    assert all(torch.equal(*pair) for pair in zip(found, again, strict=True))
+
+
+def test_a_cloud_without_a_plane_is_told_as_by_the_reference():
+    line = torch.arange(9.0)[:, None] * torch.tensor([1.0, 2.0, 3.0])
+    cube = 1e6 * random(50, 3, seed=1) + 7
+    for clouds, search in (
+        ([cube, line], {"distance": 0.01}),
+        ([cube, cube], {"distance": 1e-12, "num_hypotheses": 1}),
+        ([cube, line], {"distance": 1e-12, "num_hypotheses": 1, "probability": 0.9}),
+        ([cube], {"distance": 0.01, "up": (0, 0, 1), "max_tilt": 0.0}),
+    ):
+        told = []
+        for backend in ("cpu", "torch"):
+            with pytest.raises(NoPlaneError) as caught:
+                ransac_plane(
+                    torch.cat(clouds), ptr_from_counts([len(one) for one in clouds]), backend=backend, **search
+                )
+            told.append(str(caught.value))
+        assert told[0] == told[1]
 
 
 def test_inlier_counts_equal_the_reference():
