@@ -3,6 +3,7 @@
 // Source: Rusu et al., Toward 3D point cloud based object maps, RAS 2008; edge cases as in Open3D.
 #include <cmath>
 
+#include "pc/cells/lattice.hpp"
 #include "pc/neighbors/nearest_keys.hpp"
 #include "pc/neighbors/window_distances.hpp"
 
@@ -73,29 +74,35 @@ struct MeanDistance {
 // The sum of body(0), body(1), ... in interleaved runs, halves of which are then added to each other; the reference
 // adds in this order too, since the mask hangs on the last bit where all means are equal.
 template <class Body>
-double interleaved_sum(int64_t count, Body&& body) {
-  constexpr int64_t kRuns = 1024;
+double interleaved_sum(const pc_context& context, int64_t count, Body&& body) {
+  constexpr int64_t kRuns = 1024, kRunsPerPiece = 256;
   const int64_t runs = std::min(count, kRuns);  // the others are 0, and adding 0 changes nothing
   double run[kRuns];
-  std::fill(run, run + runs, 0.0);
-  int64_t i = 0;
-  for (; i + kRuns <= count; i += kRuns)
-    for (int64_t lane = 0; lane < kRuns; ++lane) run[lane] += body(i + lane);
-  for (int64_t lane = 0; i + lane < count; ++lane) run[lane] += body(i + lane);
+  parallel_for(context, runs, kRunsPerPiece, [&](int64_t first, int64_t last, int64_t) {
+    double own[kRunsPerPiece] = {};
+    for (int64_t start = first; start < count; start += kRuns) {
+      const int64_t some = std::min(last - first, count - start);
+      for (int64_t i = 0; i < some; ++i) own[i] += body(start + i);
+    }
+    std::copy_n(own, last - first, run + first);
+  });
   for (int64_t half = kRuns / 2; half > 0; half /= 2)
     for (int64_t lane = 0; lane < std::min(half, runs - half); ++lane) run[lane] += run[lane + half];
   return runs > 0 ? run[0] : 0.0;
 }
 
-void mark_outliers(const double* mean, int64_t count, double std_ratio, bool* outlier) {
-  const double average = interleaved_sum(count, [&](int64_t i) { return mean[i]; }) / double(count);
-  const double spread = interleaved_sum(count, [&](int64_t i) {
+void mark_outliers(const pc_context& context, const double* mean, int64_t count, double std_ratio, bool* outlier) {
+  const double average = interleaved_sum(context, count, [&](int64_t i) { return mean[i]; }) / double(count);
+  const double spread = interleaved_sum(context, count, [&](int64_t i) {
     const double off = mean[i] - average;
     return mean[i] > 0 ? off * off : 0.0;
   });
   // NaN for one point: every comparison is then false.
   const double threshold = average + std_ratio * std::sqrt(spread / double(count - 1));
-  for (int64_t i = 0; i < count; ++i) outlier[i] = !(mean[i] > 0 && mean[i] < threshold);
+  constexpr int64_t kPiece = 1 << 14;
+  parallel_for(context, count, kPiece, [&](int64_t begin, int64_t end, int64_t) {
+    for (int64_t i = begin; i < end; ++i) outlier[i] = !(mean[i] > 0 && mean[i] < threshold);
+  });
 }
 
 template <class Nearest>
@@ -138,8 +145,8 @@ PC_EXPORT int32_t pc_statistical_outliers(const pc_context* context, const float
       mean_distances<NearestDistances>(*context, clouds, task);
     else
       for (int64_t b = 0; b < num_clouds; ++b) mean_distances(*context, clouds, grid, b, task);
-    parallel_for(*context, num_clouds, 1, [&](int64_t b, int64_t, int64_t) {
-      mark_outliers(mean + ptr[b], ptr[b + 1] - ptr[b], std_ratio, outlier + ptr[b]);
+    cells::for_each_cloud(*context, ptr, num_clouds, [&](const pc_context& own, int64_t first, int64_t count) {
+      mark_outliers(own, mean + first, count, std_ratio, outlier + first);
     });
   });
 }
