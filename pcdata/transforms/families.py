@@ -55,14 +55,17 @@ class SelectTransform(Transform, abstract=True):
         """The per-point fields that picking looks at, ``source_index`` for the image; None = it may look at any."""
         return None
 
-    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
-        """Return ``index`` (M,) int64, or a (N,) bool mask, of the rows to keep, and the result's ``ptr`` (B+1,)."""
+    def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor] | Params:
+        """Return ``index`` (M,) int64, or a (N,) bool mask, of the rows to keep, and the result's ``ptr`` (B+1,).
+
+        Or, of a mask, what :func:`kept_params` makes of it: the checksums of the history then cost no second look.
+        """
         raise NotImplementedError(f"{type(self).__name__}: write the method pick(self, cloud, streams)")
 
     def make_params(self, data: PointCloud, streams: Streams) -> Params:
         """Decide which rows stay."""
-        index, ptr = self.pick(data, streams)
-        return {"index": index, "ptr": ptr}
+        picked = self.pick(data, streams)
+        return picked if isinstance(picked, dict) else dict(zip(("index", "ptr"), picked))
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Pick the rows of every field."""

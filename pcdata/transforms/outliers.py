@@ -35,12 +35,12 @@ class RemoveStatisticalOutliers(RemoveTransform):
         """The points and the image."""
         return GEOMETRY
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
+    def pick(self, cloud: PointCloud, streams: Streams) -> Params:
         """Keep the usual rows."""
         outlier = statistical_outlier_mask(
-            data.points, data.ptr, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio, grid=data.image_grid()
+            cloud.points, cloud.ptr, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio, grid=cloud.image_grid()
         )
-        return kept_params(outlier, data.ptr, gone=True)
+        return kept_params(outlier, cloud.ptr, gone=True)
 
     def fixed_keep(self, like: FixedRows) -> Callable[[FixedRows], Tensor] | None:
         """Mark the usual rows."""
@@ -62,12 +62,12 @@ class RemoveRadiusOutliers(RemoveTransform):
         """The points and the image."""
         return GEOMETRY
 
-    def make_params(self, data: PointCloud, streams: Streams) -> Params:
+    def pick(self, cloud: PointCloud, streams: Streams) -> Params:
         """Keep the rows with company."""
         outlier = radius_outlier_mask(
-            data.points, data.ptr, min_neighbors=self.min_neighbors, radius=self.radius, grid=data.image_grid()
+            cloud.points, cloud.ptr, min_neighbors=self.min_neighbors, radius=self.radius, grid=cloud.image_grid()
         )
-        return kept_params(outlier, data.ptr, gone=True)
+        return kept_params(outlier, cloud.ptr, gone=True)
 
     def params_within(self, data: PointCloud, within: Tensor) -> Params:
         """Keep the rows with company among some."""
