@@ -15,7 +15,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from random import getstate
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 import torch
 from numpy.random import get_state
@@ -65,6 +65,11 @@ def check_class(cls: type[nn.Module]) -> None:
     for hook, arguments in _HOOKS.items():
         if hook in own and callable(own[hook]) and not _takes(own[hook], None, None, None):
             raise ConfigError(f"{name}.{hook}: is called with two arguments; write\n    def {hook}(self, {arguments}):")
+    if "pick" in own and not (decides := _decides(cls)).calls & {"pick", "make_params"}:
+        raise ConfigError(
+            f"{name}.pick: is never called, as {decides.name}.make_params decides which rows stay; write that instead\n"
+            "    def make_params(self, data, streams):"
+        )
     if "forward" in own and not _takes(own["forward"], None, None, generator=None):
         raise ConfigError(
             f"{name}.forward: chains and datasets call it with generator=...; most steps need no forward, as "
@@ -83,6 +88,17 @@ def check_class(cls: type[nn.Module]) -> None:
         if field in inherited and field not in known:
             hint = f"; as a statement about the class it has no type: {field} = ..." if field in stated else ""
             raise ConfigError(f"{name}.{field}: every step has something of this name; call the field otherwise{hint}")
+
+
+class _Decides(NamedTuple):
+    name: str  # of the class whose make_params runs
+    calls: set[str]  # what it looks up
+
+
+def _decides(cls: type[nn.Module]) -> _Decides:
+    base = next(base for base in cls.__mro__ if "make_params" in vars(base))
+    code = getattr(inspect.unwrap(vars(base)["make_params"]), "__code__", None)
+    return _Decides(base.__name__, {"pick"} if code is None else set(code.co_names))
 
 
 def _takes(function: Callable[..., Any], *args: Any, **kwargs: Any) -> bool:

@@ -145,6 +145,22 @@ def test_a_class_that_no_chain_could_run_is_refused_where_it_is_written(body, wh
         written("T.Transform", body)
 
 
+@pytest.mark.parametrize("base", ["T.CropWorkspace", "T.Transform"])
+def test_a_pick_that_nothing_calls_is_refused_where_it_is_written(base):
+    with pytest.raises(
+        ConfigError, match=r"^Mine\.pick: is never called, as (\w+)\.make_params decides .*(.|\n)*def make_"
+    ):
+        written(base, "def pick(self, cloud, streams):\n    return cloud.ptr, cloud.ptr")
+
+
+@pytest.mark.parametrize("base", ["T.RemoveRadiusOutliers", "T.RemoveStatisticalOutliers", "T.RemoveDuplicates"])
+def test_a_subclass_picks_for_itself(base):
+    mine = written(
+        base, "def pick(self, cloud, streams):\n    return cloud.ptr[:-1], torch.arange(cloud.num_clouds + 1)"
+    )
+    assert mine()(cloud_in_base()).counts.tolist() == [1] * cloud_in_base().num_clouds
+
+
 def test_a_step_without_its_work_says_what_to_write():
     with pytest.raises(NotImplementedError, match=r"Mine: write the method transform\(self, data, params\)"):
         written("T.Transform", "n: int = 1")()(cloud_in_base())
