@@ -81,7 +81,8 @@ def _mapped(planes: NDArray[np.float64], old_from_new: NDArray[np.float64]) -> N
     """Multiply planes, as row vectors, with matrices, and make their normals unit vectors again."""
     moved: NDArray[np.float64] = (planes[:, :, None] * old_from_new).sum(1)
     x, y, z = moved[:, 0], moved[:, 1], moved[:, 2]
-    return moved / np.sqrt(x * x + y * y + z * z)[:, None]
+    with np.errstate(invalid="ignore"):  # no direction stays none
+        return moved / np.sqrt(x * x + y * y + z * z)[:, None]
 
 
 def plane_facts(
