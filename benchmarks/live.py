@@ -8,7 +8,9 @@ room (``seven_scenes``) and a tabletop (``tabletop_stream``) resized to 848x480,
 workspace as a robot there would have. Every frame of them goes through the offline pipeline too, and the clouds must be
 identical. Wall time is that of ``LivePipeline``, one frame after another without pause. Processor time is of all
 threads of the process and says what a busy machine does not blur; of it, what is not spent in functions of the compiled
-core is told as ``around``: Python, torch, memory that is given back. Small frames, on which kernels cost next to
+core is told as ``around``: Python, torch, memory that is given back. Between the frames a probe without pcdata looks
+whether two threads have a core each (:mod:`own_cores`): a host may run both processors of a virtual machine on one for
+a while. Frames that had two cores are told once more by themselves. Small frames, on which kernels cost next to
 nothing, tell the same of each step once more.
 
 Memory is looked at after 100 and after 10,000 small frames through the same chain, and must not have grown.
@@ -37,6 +39,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from own_cores import EVERY, core_probe
 from timing import RESULTS, facts
 
 import pcdata
@@ -113,12 +116,14 @@ class Measured:
 
     def __init__(self) -> None:
         self.seconds: list[float] = []
+        self.own_cores: list[bool] = []  # whether two threads of anything had a core each about then
         self.processor: list[float] = []
         self.points: list[int] = []
         self.steps: dict[str, tuple[list[float], ...]] = {}  # seconds by the wall, of processors, of these around
 
     def add(self, other: Measured) -> None:
         self.seconds += other.seconds
+        self.own_cores += other.own_cores
         self.processor += other.processor
         self.points += other.points
         for name, taken in other.steps.items():
@@ -197,14 +202,20 @@ def measure(frames: list[pcdata.DepthFrame], box: Box, count: int) -> Measured:
         live = LivePipeline(chain(box), like=part[0], same_pixels=len(part) > 1)
         for frame in part:
             check_identical(live, frame, offline)
-        for number, frame in zip(range(-(-count * len(part) // len(frames))), itertools.cycle(part)):
-            processor = time.process_time()
-            answer = live(frame)
-            measured.processor.append(time.process_time() - processor)
-            cloud_of(answer)
-            measured.seconds.append(answer.seconds)
-            if number % 8 == 0:
-                by_steps(offline, frame, measured)
+        share = -(-count * len(part) // len(frames))
+        with core_probe() as cores:
+            for number, frame in zip(range(share), itertools.cycle(part)):
+                if number % EVERY == 0:
+                    cores.look()
+                processor = time.process_time()
+                answer = live(frame)
+                measured.processor.append(time.process_time() - processor)
+                cloud_of(answer)
+                measured.seconds.append(answer.seconds)
+                if number % 8 == 0:
+                    by_steps(offline, frame, measured)
+            cores.look()
+            measured.own_cores += cores.had_own_cores(share)
     return measured
 
 
@@ -214,8 +225,10 @@ def figures(seconds: list[float]) -> dict[str, float]:
 
 
 def summary(measured: Measured) -> dict[str, Any]:
+    own = [seconds for seconds, had in zip(measured.seconds, measured.own_cores) if had]
     return {
         "frames": len(measured.seconds),
+        "own_cores": {"frames": len(own), "wall": figures(own) if own else None},
         "points_after_crop": {"median": int(np.median(measured.points)), "most": max(measured.points)},
         "wall": figures(measured.seconds),
         "processor": figures(measured.processor),
@@ -389,6 +402,10 @@ def tell(name: str, told: dict[str, Any]) -> None:
         rows.append([step, *(f"{values['wall'][f'{key}_ms']:.2f}" for key in keys)])
         rows.append(["  processor", *(f"{values['processor'][f'{key}_ms']:.2f}" for key in keys)])
         rows.append(["  around", *(f"{values['around'][f'{key}_ms']:.2f}" for key in keys)])
+    own = told["own_cores"]
+    if own["wall"] is not None:
+        whole = [f"{own['wall'][f'{key}_ms']:.2f}" for key in keys]
+        rows.insert(1, [f"  of these, {own['frames']} on two cores", *whole])
     points = told["points_after_crop"]
     print(f"{name}: {told['frames']} frames, {points['median']} points after the crop ({points['most']} at most)")
     print(text_table(["ms", *keys], rows), "\n")
