@@ -158,9 +158,9 @@ def require_planes(found: Tensor, tried: int, distance: float, first_cloud: int)
         distance: from a plane.
         first_cloud: the number of the first of these.
     """
-    if bool((found[:, 2] >= 3).all()):
-        return
     listed = found.tolist()
+    if all(near >= 3 for _, _, near in listed):
+        return
     for cloud, (planes, competing, near) in enumerate(listed):
         if near < 3 and competing == 0:
             reason = (

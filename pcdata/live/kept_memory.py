@@ -7,6 +7,8 @@ import functools
 import os
 import sys
 
+from pcdata.kernels.cpu.native import remember_advice
+
 # glibc's names for what is set, from malloc.h; and what is set, in bytes.
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 _KEPT, _FROM_HEAP = 256 << 20, 32 << 20  # the second is the most that glibc allows
@@ -28,4 +30,7 @@ def keep_freed_memory() -> bool:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):  # another library than glibc
         return False
-    return all([mallopt(_MMAP_THRESHOLD, _FROM_HEAP) == 1, mallopt(_TRIM_THRESHOLD, _KEPT) == 1])
+    kept = all([mallopt(_MMAP_THRESHOLD, _FROM_HEAP) == 1, mallopt(_TRIM_THRESHOLD, _KEPT) == 1])
+    if kept:
+        remember_advice(_FROM_HEAP)
+    return kept

@@ -28,7 +28,7 @@ from pcdata.structures.joining import joinable_parts, rows_per_cloud
 from pcdata.structures.kinds import FIELDS, METRE, Kind, attributes, averaged, fillers, moved, present_fields
 from pcdata.structures.padded import PaddedClouds, padded_clouds
 from pcdata.structures.point_arrays import attributes_of_arrays
-from pcdata.structures.read_later import Histories, Metas, OfClouds, Step
+from pcdata.structures.read_later import Histories, MadeWhenRead, Metas, OfClouds, Step
 from pcdata.structures.showing import shown_page
 from pcdata.structures.signals import told_signals
 from pcdata.structures.structure import checked_copy, derived
@@ -198,13 +198,15 @@ class PointCloud(CloudBatch):
         """Add or replace one extra per-point field of the given kind."""
         return checked_copy(self, extra={**self.extra, name: value}, kinds={**self.kinds, name: Kind(kind)})
 
-    def with_meta(self, entries: Sequence[Mapping[str, Any]]) -> PointCloud:
+    def with_meta(self, entries: Sequence[Mapping[str, Any]] | MadeWhenRead) -> PointCloud:
         """Merge one mapping of JSON-able findings into the meta of each cloud.
 
         Raises:
             ValueError: there is not one mapping for each cloud.
         """
         held = vars(self)["meta"]
+        if isinstance(entries, MadeWhenRead) and len(entries) == len(held):
+            return derived(self, meta=(held if isinstance(held, Metas) else Metas([held])).then(entries))
         if isinstance(held, Metas) and len(entries) == len(held):
             return derived(self, meta=held.then([*map(dict, entries)]))
         return derived(self, meta=tuple([{**old, **new} for old, new in zip(held, entries, strict=True)]))

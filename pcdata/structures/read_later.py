@@ -137,16 +137,18 @@ class MadeWhenRead:
     __slots__ = ("_count", "_found", "_make")
 
     def __init__(self, count: int, make: Callable[[], Sequence[Step]]) -> None:
-        self._count, self._make = count, make
-        self._found: Sequence[Step] | None = None
+        self._count = count
+        self._make: Callable[[], Sequence[Step]] | None = make
+        self._found: Sequence[Step] = ()
 
     def __len__(self) -> int:
         return self._count
 
     def _all(self) -> Sequence[Step]:
-        if self._found is None:
-            self._found = self._make()
-            del self._make  # and the memory that it looked at
+        make = self._make
+        if make is not None:  # another thread that asks meanwhile finds out the same
+            self._found = make()
+            self._make = None  # and the memory that it looked at
         return self._found
 
     def __getitem__(self, clouds: slice) -> MadeWhenRead:

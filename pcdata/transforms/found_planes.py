@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any
@@ -91,39 +91,50 @@ def plane_facts(
     num_inliers: Tensor,  # (B,) points near each, of walls that cross it too
     corners: Tensor,  # of their surfaces, (B, C) rows, -1 behind the last
     rms: Tensor,  # (B,)
-) -> list[dict[str, Any]]:
-    """Return what is stored of each cloud's plane, in the source frame: itself, its share, its spread, and its hull."""
-    source_from_cloud = cloud.source_from_cloud.cpu().numpy()
-    source_planes = _mapped(planes, np.linalg.inv(source_from_cloud))
-    hulls = _hulls(cloud.points.detach(), planes, corners, source_from_cloud).round(_DIGITS).tolist()
-    num_corners = np.count_nonzero(corners.numpy() >= 0, axis=1).tolist()
+) -> Callable[[], list[dict[str, Any]]]:
+    """Return what finds out what is stored of each cloud's plane: itself, its share, its spread, and its hull.
+
+    All in the source frame. The cloud is read at once, and its points are not kept in memory.
+    """
+    places, matrices = _places(cloud.points.detach(), corners), cloud.source_from_cloud.cpu().numpy().copy()
     counts, frame = counts_of(cloud.ptr), cloud.source_frame
-    return [
-        {
-            "normal": plane[:3],
-            "offset": plane[3],
-            "frame": frame,
-            "num_inliers": inliers,
-            "inlier_share": inliers / max(count, 1),
-            "rms": spread,
-            "hull": hull[:num],
-        }
-        for plane, inliers, count, spread, hull, num in zip(
-            source_planes.tolist(), num_inliers.tolist(), counts, rms.tolist(), hulls, num_corners
-        )
-    ]
+
+    def facts() -> list[dict[str, Any]]:
+        source_planes = _mapped(planes, np.linalg.inv(matrices))
+        hulls = _hulls(places, planes, matrices).round(_DIGITS).tolist()
+        num_corners = np.count_nonzero(corners.numpy() >= 0, axis=1).tolist()
+        return [
+            {
+                "normal": plane[:3],
+                "offset": plane[3],
+                "frame": frame,
+                "num_inliers": inliers,
+                "inlier_share": inliers / max(count, 1),
+                "rms": spread,
+                "hull": hull[:num],
+            }
+            for plane, inliers, count, spread, hull, num in zip(
+                source_planes.tolist(), num_inliers.tolist(), counts, rms.tolist(), hulls, num_corners
+            )
+        ]
+
+    return facts
 
 
-def _hulls(
-    points: Tensor, planes: NDArray[np.float64], corners: Tensor, source_from_cloud: NDArray[np.float64]
-) -> NDArray[np.float64]:  # (B, C, 3)
-    """Return the corners moved onto the planes, in the source frame; anything where there is none."""
+def _places(points: Tensor, corners: Tensor) -> NDArray[np.floating]:  # (B, C, 3)
+    """Return where the corners are; anything where there is none."""
     if not len(points):
         return np.zeros((*corners.shape, 3))
     if points.device.type == "cpu":
-        places = points.numpy()[corners.numpy()].astype(np.float64)
-    else:
-        places = points[corners.to(points.device)].cpu().double().numpy()
+        return points.numpy()[corners.numpy()]
+    return points[corners.to(points.device)].cpu().numpy()
+
+
+def _hulls(
+    corners: NDArray[np.floating], planes: NDArray[np.float64], source_from_cloud: NDArray[np.float64]
+) -> NDArray[np.float64]:  # (B, C, 3)
+    """Return the corners moved onto the planes, in the source frame."""
+    places = corners.astype(np.float64)
     normals, offsets = planes[:, None, :3], planes[:, None, 3:]
     flat = places - ((places * normals).sum(2, keepdims=True) + offsets) * normals
     moved: NDArray[np.float64] = (flat[:, :, None, :] * source_from_cloud[:, None, :3, :3]).sum(3)

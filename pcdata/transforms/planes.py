@@ -190,7 +190,7 @@ class RemovePlane(RemoveTransform):
             "index": keep,
             "ptr": kept_ptr if self.keep == "both" else ptr_after_mask(keep, data.ptr),
             "planes": planes,
-            "num_inliers": data.counts - kept_ptr.diff() if is_slab else count_per_cloud(own, data.ptr),
+            "num_inliers": (data.ptr - kept_ptr).diff() if is_slab else count_per_cloud(own, data.ptr),
             "per_point": patch,
             "corners": corners,
             "rms": rms,
@@ -289,28 +289,38 @@ class RemovePlane(RemoveTransform):
         found = {**params, "planes": told, "num_inliers": inliers}
 
         def entries() -> list[dict[str, Any]]:
-            return self._entries(before, self._apart(before, told, negated(params["index"])) | found)
+            return [*self._entries(before, self._apart(before, told, negated(params["index"])) | found)]
 
         return found, MadeWhenRead(len(had), entries)
 
-    def _entries(self, data: PointCloud, params: Params) -> list[dict[str, Any]]:
-        """Return what the meta of each cloud is told of its plane."""
-        entries: list[dict[str, Any]] = []
+    def _entries(self, data: PointCloud, params: Params) -> MadeWhenRead:
+        """Return what the meta of each cloud is told of its plane; most of it is found out when somebody reads it."""
         planes = params["planes"].detach().cpu().numpy()
         facts = plane_facts(data, planes, params["num_inliers"], params["corners"], params["rms"])
-        for b, (found, plane) in enumerate(zip(facts, planes.tolist())):
-            found["faces"] = self._faces(data, b, plane)
-            for name in ("noise", "disparity_noise"):
-                if name in params and math.isfinite(value := float(params[name][b])):
-                    found[name] = value
-            if "believed" in params:
-                found["cut"] = self.cut if bool(params["believed"][b]) else "nothing"
-                self._warn_of_no_table(data, b, found["cut"])
-            if self.up is not None:
-                found["tilt"] = self._tilt(plane)
-                self._warn_of_tilt(data, b, found["tilt"])
-            entries.append({"planes": [*data.meta[b].get("planes", []), found]})
-        return entries
+        more = [self._judged(data, params, b, plane) for b, plane in enumerate(planes.tolist())]
+        before = [[*meta.get("planes", ())] for meta in data.meta]
+
+        def entries() -> list[dict[str, Any]]:
+            return [
+                {"planes": [*had, {**found, **judged}]}
+                for had, found, judged in zip(before, facts(), more, strict=True)
+            ]
+
+        return MadeWhenRead(len(more), entries)
+
+    def _judged(self, data: PointCloud, params: Params, b: int, plane: Sequence[float]) -> dict[str, Any]:
+        """Return what is told of a plane beside where it is, and warn of what is odd about it."""
+        found: dict[str, Any] = {"faces": self._faces(data, b, plane)}
+        for name in ("noise", "disparity_noise"):
+            if name in params and math.isfinite(value := float(params[name][b])):
+                found[name] = value
+        if "believed" in params:
+            found["cut"] = self.cut if bool(params["believed"][b]) else "nothing"
+            self._warn_of_no_table(data, b, found["cut"])
+        if self.up is not None:
+            found["tilt"] = self._tilt(plane)
+            self._warn_of_tilt(data, b, found["tilt"])
+        return found
 
     def _warn_of_no_table(self, data: PointCloud, b: int, cut: str) -> None:
         """Say that the table could not be measured."""

@@ -1,7 +1,10 @@
 from __future__ import annotations
 
+import gc
 import json
 import math
+import pickle
+import weakref
 
 import pytest
 import torch
@@ -56,6 +59,20 @@ def test_the_stored_plane_is_in_the_source_frame():
     camera_from_base = rigid.invert_rigid(cloud.frames["base"][0])
     expected = camera_from_base[:3, :3] @ torch.tensor([0.0, 0, 1]).double()
     torch.testing.assert_close(torch.tensor(plane["normal"]).double(), expected, atol=1e-5, rtol=0)
+
+
+def test_what_is_told_of_a_plane_is_found_out_late_and_is_that_of_its_time():
+    cloud = cloud_in_base((100,))
+    at_once, late, copied = (TABLE(cloud) for _ in range(3))
+    told = at_once.meta[0]["planes"]
+    points = weakref.ref(cloud.points.untyped_storage())
+    cloud.source_from_cloud.mul_(2)
+    cloud.points.zero_()
+    del cloud
+    gc.collect()
+    assert points() is None  # what is told later holds no points
+    assert late.meta[0]["planes"] == told
+    assert pickle.loads(pickle.dumps(copied)).meta[0]["planes"] == told
 
 
 def test_the_plane_follows_whatever_is_done_to_the_cloud_later():

@@ -28,6 +28,7 @@ INSTRUCTION_SETS = ("baseline", "avx2", "avx512")
 FORCE_VARIABLE = "PCDATA_INSTRUCTION_SET"
 
 _LARGE = 4 << 20  # bytes: holds a huge page (2 MB) wherever it starts
+_HUGE_PAGE_BITS = 21
 
 _CPU = torch.device("cpu")
 
@@ -160,9 +161,33 @@ def room_for(*results: tuple[Sequence[int], torch.dtype]) -> list[Tensor]:
     """Return uninitialized memory for results of these shapes; if large, in huge pages where the system has them."""
     rooms = [torch.empty(shape, dtype=dtype, device=_CPU) for shape, dtype in results]
     sizes = [room.nbytes for room in rooms]
-    if sum(sizes) >= _LARGE:
+    if sum(sizes) >= _LARGE and not _is_advised(rooms, sizes):
         call("pc_advise_huge_pages", len(rooms), addresses(rooms), numbers(sizes))
     return rooms
+
+
+def remember_advice(below: int) -> None:
+    """Ask for huge pages once where the process keeps what it frees: blocks of less bytes than this."""
+    global _kept_below
+    _kept_below = below
+
+
+_kept_below = 0  # bytes; larger blocks are given back, and with them what was advised
+_advised: set[int] = set()  # the huge pages of the others
+
+
+def _is_advised(rooms: Sequence[Tensor], sizes: Sequence[int]) -> bool:
+    """Tell whether the system was asked about this memory before; it is about to be."""
+    pages: set[int] = set()
+    for result, size in zip(rooms, sizes):
+        if size >= _kept_below:
+            return False
+        if size >= 1 << _HUGE_PAGE_BITS:  # nothing is asked about smaller ones
+            start = result.data_ptr()
+            pages.update(range(start >> _HUGE_PAGE_BITS, (start + size - 1 >> _HUGE_PAGE_BITS) + 1))
+    known = pages <= _advised
+    _advised.update(pages)
+    return known
 
 
 def room(shape: int | Sequence[int], dtype: torch.dtype) -> Tensor:

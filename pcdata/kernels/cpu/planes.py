@@ -48,9 +48,9 @@ def ransac_plane(
         own, own_ptr = clouds_between(points, ptr, some.start, some.stop)
         rows = slice(0, len(points)) if own is points else slice(int(ptr[some.start]), int(ptr[some.stop]))
         given = (None if value is None else value[some].contiguous() for value in (guess, up))
-        arrays = own, own_ptr, len(which), words, num_hypotheses, which
-        call("pc_ransac_planes", *arrays, *given, *rules, planes[some], near[rows], found[some])
-        require_planes(found[some], num_hypotheses + (guess is not None), distance, first)
+        arrays, told = (own, own_ptr, len(which), words, num_hypotheses, which), found[some]
+        call("pc_ransac_planes", *arrays, *given, *rules, planes[some], near[rows], told)
+        require_planes(told, num_hypotheses + (guess is not None), distance, first)
     return planes, near
 
 

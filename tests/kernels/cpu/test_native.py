@@ -47,3 +47,24 @@ def test_calls_with_too_few_arguments_and_fractions_for_counts_are_refused():
         native.call("pc_inside_box", torch.zeros(4, 3))
     with pytest.raises(TypeError, match="pc_inside_box: argument 3: "):
         native.call("pc_inside_box", torch.zeros(4, 3), 4.5, torch.zeros(3), torch.ones(3), None, finite)
+
+
+def test_huge_pages_are_asked_for_once_where_memory_is_kept_and_each_time_where_it_is_not(monkeypatch):
+    asked = []
+    monkeypatch.setattr(native, "call", lambda *arguments: asked.append(arguments[0]))
+    monkeypatch.setattr(native, "_advised", set())
+    monkeypatch.setattr(native, "_kept_below", 0)
+    block, other = torch.empty(8 << 20, dtype=torch.uint8), torch.empty(8 << 20, dtype=torch.uint8)
+    given = iter([block, block, block, block, other, other])
+    monkeypatch.setattr(native.torch, "empty", lambda *_, **__: next(given))
+    for times in (1, 2):
+        native.room_for(((8 << 20,), torch.uint8))
+        assert len(asked) == times
+    native.remember_advice(32 << 20)
+    for times in (3, 3, 4, 4):
+        native.room_for(((8 << 20,), torch.uint8))
+        assert len(asked) == times
+    native.remember_advice(4 << 20)  # now the block is too large to be kept
+    given = iter([block])
+    native.room_for(((8 << 20,), torch.uint8))
+    assert len(asked) == 5
