@@ -73,8 +73,8 @@ def words_of_clouds(counts: Sequence[int], count: int, seeds: Sequence[int]) -> 
         kept = [words for words in found if words is not None]
         if len(kept) == len(found):
             words = kept[0][None] if len(kept) == 1 else torch.stack(kept)
-            return words, torch.tensor(which, dtype=torch.int64, device="cpu")
+            return words, torch.from_numpy(np.array(which, np.int64))
     draws: dict[tuple[int, int], int] = {}
     which = [draws.setdefault(draw, len(draws)) for draw in zip(counts, seeds)]
     words = torch.stack([torch.stack(_numbers_of_rows(size, 3, count, seeded(seed))) for size, seed in draws])
-    return words, torch.tensor(which, dtype=torch.int64, device="cpu")
+    return words, torch.from_numpy(np.array(which, np.int64))
