@@ -4,7 +4,7 @@
 namespace pc::sampling {
 namespace {
 
-constexpr int64_t kGroupsPerPiece = 32;
+constexpr int64_t kGroupsPerPiece = 8;
 // Leaves visited before Ctrl-C is looked for: about 50 ms at 25 ns each.
 constexpr int64_t kBudget = int64_t{1} << 21;
 

@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <vector>
 
 #include "pc/sampling/farthest.hpp"
@@ -20,29 +21,29 @@ class PointGroups {
   // Place all points; false, and nothing is done, where the order of the points says too little of where they lie.
   bool place() {
     if (sampler_.count() < kFewPoints || !(find_widest() >= 0)) return false;
-    measure();
     sort_out();
-    if (static_cast<int64_t>(loose_.size()) > sampler_.count() / 4) return false;
-    sort::MortonPoints order(scratch_, std::max<int64_t>(num_narrow_, static_cast<int64_t>(loose_.size())));
+    const auto num_loose = static_cast<int64_t>(loose_.size());
+    if (num_loose > sampler_.count() / 4) return false;
+    sort::MortonPoints order(scratch_, std::max(num_narrow_, num_loose));
     order.parallel(context_, scratch_, middle_, num_narrow_,
                    [&](const sort::PlacedPoint* groups, int64_t count, int64_t at) {
                      for (int64_t i = 0; i < count; ++i)
-                       sampler_.place_rows(kGroup * narrow_[groups[i].row()], kGroup, kGroup * (at + i));
+                       sampler_.place_eight(kGroup * narrow_[groups[i].row()], kGroup * (at + i));
                    });
     if (loose_.empty()) return true;
-    auto* points = scratch_.take<float>(3 * static_cast<int64_t>(loose_.size()));
+    auto* points = scratch_.take<float>(3 * num_loose);
     for (size_t i = 0; i < loose_.size(); ++i) std::copy_n(sampler_.points() + 3 * loose_[i], 3, points + 3 * i);
-    order.serial(points, static_cast<int64_t>(loose_.size()), 0,
-                 [&](const sort::PlacedPoint* some, int64_t count, int64_t at) {
-                   for (int64_t i = 0; i < count; ++i)
-                     sampler_.place_rows(loose_[some[i].row()], 1, kGroup * num_narrow_ + at + i);
-                 });
+    order.serial(points, num_loose, 0, [&](const sort::PlacedPoint* some, int64_t count, int64_t at) {
+      for (int64_t i = 0; i < count; ++i)
+                     sampler_.place_one(loose_[some[i].row()], kGroup * num_narrow_ + at + i);
+    });
     return true;
   }
 
  private:
-  static constexpr int64_t kGroup = 8;
+  static constexpr int64_t kGroup = FarthestSampler::kSideBySide;
   static constexpr int64_t kFewPoints = 1 << 13;  // the usual order takes no longer
+  static constexpr int64_t kPiece = 1024;         // groups measured by one thread
   static constexpr int64_t kLooked = 256;         // groups that tell of all
 
   // Middle and half the longest side of a group's box.
@@ -52,17 +53,17 @@ class PointGroups {
 
   Extent extent(int64_t group) const {
     const float* p = sampler_.points() + 3 * kGroup * group;
-    Extent found{{0, 0, 0}, 0};
-    for (int axis = 0; axis < 3; ++axis) {
-      float low = p[axis], high = low;
-      for (int i = 1; i < kGroup; ++i) {
-        low = std::min(low, p[3 * i + axis]);
-        high = std::max(high, p[3 * i + axis]);
-      }
-      found.middle[axis] = 0.5F * low + 0.5F * high;
-      found.half = std::max(found.half, 0.5F * high - 0.5F * low);
-    }
-    return found;
+    auto low = load<sort::Float4>(p), high = low;
+    const auto include = [&](sort::Float4 point) {
+      low = point < low ? point : low;
+      high = point > high ? point : high;
+    };
+    for (int i = 1; i + 1 < kGroup; ++i) include(load<sort::Float4>(p + 3 * i));
+    // What follows the last point may be no memory of the cloud's: read it with the number before it.
+    const auto last = load<sort::Float4>(p + 3 * kGroup - 4);
+    include(sort::Float4{last[1], last[2], last[3], last[3]});
+    const sort::Float4 middle = 0.5F * low + 0.5F * high, half = 0.5F * high - 0.5F * low;
+    return {{middle[0], middle[1], middle[2]}, std::max(std::max(std::max(0.0F, half[0]), half[1]), half[2])};
   }
 
   static float median(std::vector<float>& numbers) {
@@ -94,33 +95,36 @@ class PointGroups {
     return widest_;
   }
 
-  void measure() {
+  // Put the middles of narrow groups together, and list the points of all others.
+  void sort_out() {
     middle_ = scratch_.take<float>(3 * count_);
-    half_ = scratch_.take<float>(count_);
-    parallel_for(context_, count_, 2048, [&](int64_t begin, int64_t end, int64_t) {
+    narrow_ = scratch_.take<uint32_t>(count_);
+    std::vector<int64_t> found(static_cast<size_t>((count_ + kPiece - 1) / kPiece));
+    parallel_for(context_, count_, kPiece, [&](int64_t begin, int64_t end, int64_t) {
+      int64_t to = begin;
       for (int64_t group = begin; group < end; ++group) {
         const Extent own = extent(group);
-        std::copy_n(own.middle, 3, middle_ + 3 * group);
-        half_[group] = own.half;
+        std::copy_n(own.middle, 3, middle_ + 3 * to);
+        narrow_[to] = static_cast<uint32_t>(group);
+        to += own.half <= widest_ ? 1 : 0;
       }
+      found[static_cast<size_t>(begin / kPiece)] = to - begin;
     });
-  }
-
-  // Move the middles of narrow groups together, and list the points of all others.
-  void sort_out() {
-    narrow_ = scratch_.take<uint32_t>(count_);
-    const auto loosen = [&](int64_t begin, int64_t end) {
-      for (int64_t row = begin; row < end; ++row) loose_.push_back(static_cast<uint32_t>(row));
+    int64_t next = 0;  // group
+    const auto loosen_until = [&](int64_t row) {
+      for (int64_t i = kGroup * next; i < row; ++i) loose_.push_back(static_cast<uint32_t>(i));
     };
-    for (int64_t group = 0; group < count_; ++group) {
-      if (!(half_[group] <= widest_)) {
-        loosen(kGroup * group, kGroup * (group + 1));
-        continue;
+    for (size_t piece = 0; piece < found.size(); ++piece) {
+      const int64_t begin = static_cast<int64_t>(piece) * kPiece;
+      std::memmove(middle_ + 3 * num_narrow_, middle_ + 3 * begin, static_cast<size_t>(found[piece]) * 12);
+      for (int64_t i = 0; i < found[piece]; ++i) {
+        const uint32_t group = narrow_[begin + i];
+        loosen_until(kGroup * group);
+        next = int64_t{group} + 1;
+        narrow_[num_narrow_++] = group;
       }
-      std::copy_n(middle_ + 3 * group, 3, middle_ + 3 * num_narrow_);
-      narrow_[num_narrow_++] = static_cast<uint32_t>(group);
     }
-    loosen(kGroup * count_, sampler_.count());
+    loosen_until(sampler_.count());
   }
 
   const pc_context& context_;
@@ -128,7 +132,7 @@ class PointGroups {
   FarthestSampler& sampler_;
   int64_t count_;
   float widest_ = -1;
-  float *middle_ = nullptr, *half_ = nullptr;
+  float* middle_ = nullptr;  // of narrow groups
   uint32_t* narrow_ = nullptr;  // groups
   int64_t num_narrow_ = 0;
   std::vector<uint32_t> loose_;  // rows

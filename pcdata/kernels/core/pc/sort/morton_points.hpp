@@ -54,12 +54,14 @@ class MortonPoints {
   template <class Write>
   void parallel(const pc_context& context, ScratchFrame& scratch, const float* points, int64_t count,
                 const Write& write) {
-    const int64_t chunks = (count + kChunk - 1) / kChunk;
+    const int64_t share = (count + context.threads - 1) / context.threads;
+    const int64_t chunk = std::min(std::max(share, kSmallChunk), kChunk);
+    const int64_t chunks = (count + chunk - 1) / chunk;
     // Call body(chunk, its points, its keys, their number) for all chunks.
     auto for_chunks = [&](auto&& body) {
       parallel_for(context, chunks, 1, [&](int64_t c, int64_t, int64_t) {
-        const int64_t begin = c * kChunk;
-        body(c, [=](int64_t i) { return at(points, begin + i); }, keys_ + begin, std::min(count - begin, kChunk));
+        const int64_t begin = c * chunk;
+        body(c, [=](int64_t i) { return at(points, begin + i); }, keys_ + begin, std::min(count - begin, chunk));
       });
     };
     Box* boxes = scratch.take<Box>(chunks);
@@ -100,7 +102,8 @@ class MortonPoints {
   static constexpr size_t kMaxCells = size_t{1} << (3 * kMaxBits);
   static constexpr int64_t kEnough = 64;         // a cell of so many points is not cut further
   static constexpr int64_t kWantedPerCell = 16;  // on a surface, which crosses about 4^bits of the 8^bits cells
-  static constexpr int64_t kChunk = 1 << 16;     // points per piece of parallel work
+  static constexpr int64_t kChunk = 1 << 16;     // points per piece of parallel work, at most
+  static constexpr int64_t kSmallChunk = 1 << 12;
   static constexpr int64_t kCellsPerPiece = 32;
 
   struct Box {
