@@ -25,14 +25,20 @@ void start(Task& task, sort::MortonPoints& order) {
 }
 
 void start_in_parallel(const pc_context& context, ScratchFrame& scratch, FarthestSampler& sampler) {
-  if (!PointGroups(context, scratch, sampler).place()) {
+  PointGroups groups(context, scratch, sampler);
+  const bool in_groups = groups.put_in_order();
+  if (!in_groups) {
     sort::MortonPoints order(scratch, sampler.count());
     order.parallel(
         context, scratch, sampler.points(), sampler.count(),
         [&](const sort::PlacedPoint* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
   }
-  parallel_for(context, sampler.num_leaf_groups(), kGroupsPerPiece,
-               [&](int64_t begin, int64_t end, int64_t) { sampler.start_leaf_groups(begin, end); });
+  parallel_for(context, sampler.num_leaf_groups(), kGroupsPerPiece, [&](int64_t begin, int64_t end, int64_t) {
+    for (int64_t group = begin; group < end; ++group) {
+      if (in_groups) groups.place(group, group + 1);
+      sampler.start_leaf_groups(group, group + 1);
+    }
+  });
   sampler.start_levels();
 }
 

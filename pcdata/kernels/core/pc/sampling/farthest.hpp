@@ -20,9 +20,9 @@ namespace pc::sampling {
 // above the distance of a point in the box, and skipping a box that is not nearer than its farthest point is exact.
 class FarthestSampler {
  public:
-  static constexpr int kLeaf = 32;  // two AVX-512 registers; 20 bytes a point, and 1.2 more for the nodes
+  static constexpr int kLeaf = 32;       // two AVX-512 registers; 20 bytes a point, and 1.2 more for the nodes
   static constexpr int kSideBySide = 8;  // a part of a leaf
-  static constexpr int kFan = 16;   // children tested at once
+  static constexpr int kFan = 16;        // children tested at once
 
   FarthestSampler(ScratchFrame& scratch, const float* points, int64_t count)
       : points_(points), count_(count), num_leaves_((count + kLeaf - 1) / kLeaf) {

@@ -18,26 +18,37 @@ class PointGroups {
   PointGroups(const pc_context& context, ScratchFrame& scratch, FarthestSampler& sampler)
       : context_(context), scratch_(scratch), sampler_(sampler), count_(sampler.count() / kGroup) {}
 
-  // Place all points; false, and nothing is done, where the order of the points says too little of where they lie.
-  bool place() {
+  // Put all points in order; false, and nothing is done, where the given order says too little of where they lie.
+  bool put_in_order() {
     if (sampler_.count() < kFewPoints || !(find_widest() >= 0)) return false;
     sort_out();
     const auto num_loose = static_cast<int64_t>(loose_.size());
     if (num_loose > sampler_.count() / 4) return false;
     sort::MortonPoints order(scratch_, std::max(num_narrow_, num_loose));
+    sorted_ = scratch_.take<uint32_t>(num_narrow_);
     order.parallel(context_, scratch_, middle_, num_narrow_,
                    [&](const sort::PlacedPoint* groups, int64_t count, int64_t at) {
-                     for (int64_t i = 0; i < count; ++i)
-                       sampler_.place_eight(kGroup * narrow_[groups[i].row()], kGroup * (at + i));
+                     for (int64_t i = 0; i < count; ++i) sorted_[at + i] = narrow_[groups[i].row()];
                    });
     if (loose_.empty()) return true;
     auto* points = scratch_.take<float>(3 * num_loose);
     for (size_t i = 0; i < loose_.size(); ++i) std::copy_n(sampler_.points() + 3 * loose_[i], 3, points + 3 * i);
     order.serial(points, num_loose, 0, [&](const sort::PlacedPoint* some, int64_t count, int64_t at) {
-      for (int64_t i = 0; i < count; ++i)
-                     sampler_.place_one(loose_[some[i].row()], kGroup * num_narrow_ + at + i);
+      for (int64_t i = 0; i < count; ++i) sampler_.place_one(loose_[some[i].row()], kGroup * num_narrow_ + at + i);
     });
     return true;
+  }
+
+  // Once they are in order: place the points of some groups of leaves. Groups are independent of one another.
+  void place(int64_t begin, int64_t end) {
+    constexpr int64_t kEach = FarthestSampler::kLeaf * FarthestSampler::kFan / kGroup, kAhead = 8;
+    const int64_t last = std::min(end * kEach, num_narrow_);
+    for (int64_t at = begin * kEach; at < last; ++at) {
+      const float* soon = sampler_.points() + 3 * kGroup * sorted_[std::min(at + kAhead, num_narrow_ - 1)];
+      __builtin_prefetch(soon);
+      __builtin_prefetch(soon + 3 * kGroup - 1);
+      sampler_.place_eight(kGroup * int64_t{sorted_[at]}, kGroup * at);
+    }
   }
 
  private:
@@ -132,8 +143,9 @@ class PointGroups {
   FarthestSampler& sampler_;
   int64_t count_;
   float widest_ = -1;
-  float* middle_ = nullptr;  // of narrow groups
+  float* middle_ = nullptr;     // of narrow groups
   uint32_t* narrow_ = nullptr;  // groups
+  uint32_t* sorted_ = nullptr;  // the same in order
   int64_t num_narrow_ = 0;
   std::vector<uint32_t> loose_;  // rows
 };

@@ -103,7 +103,7 @@ class MortonPoints {
   static constexpr int64_t kEnough = 64;         // a cell of so many points is not cut further
   static constexpr int64_t kWantedPerCell = 16;  // on a surface, which crosses about 4^bits of the 8^bits cells
   static constexpr int64_t kChunk = 1 << 16;     // points per piece of parallel work, at most
-  static constexpr int64_t kSmallChunk = 1 << 12;
+  static constexpr int64_t kSmallChunk = 1 << 13;
   static constexpr int64_t kCellsPerPiece = 32;
 
   struct Box {
