@@ -7,6 +7,7 @@ long.
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,13 +18,12 @@ import torch
 
 from pcdata.threads import torch_on_one_thread
 
-EVERY = 4  # frames from one probe to the next
 OWN = 1.15  # of what one thread takes: below, two threads have a core each
 _SIZE, _TIMES = 192, 6
 
 
 class CoreProbe:
-    """Probes, one before each few frames and one behind the last."""
+    """Probes between frames, before the first and behind the last."""
 
     def __init__(self, second: ThreadPoolExecutor) -> None:
         self._second = second
@@ -32,10 +32,17 @@ class CoreProbe:
         self._both: list[float] = []
 
     def look(self) -> None:
+        """Probe before the first frame, and behind each."""
         with torch_on_one_thread():
             self._alone.append(self._multiply())
             other = self._second.submit(self._multiply)
             self._both.append(max(self._multiply(), other.result()))
+
+    def look_again(self) -> None:
+        """Probe once more before the next frame, as something else was done meanwhile."""
+        alone, both = self._alone.pop(), self._both.pop()
+        self.look()
+        self._alone[-1], self._both[-1] = max(alone, self._alone[-1]), max(both, self._both[-1])
 
     def _multiply(self) -> float:
         since = time.perf_counter()
@@ -43,11 +50,11 @@ class CoreProbe:
             torch.mm(self._matrix, self._matrix)
         return time.perf_counter() - since
 
-    def had_own_cores(self, frames: int) -> list[bool]:
+    def had_own_cores(self) -> list[bool]:
         """Say of each frame whether the probes before and behind it found two cores."""
         fastest = float(np.percentile(self._alone, 10))
         own = [both < OWN * fastest for both in self._both]
-        return [own[number // EVERY] and own[number // EVERY + 1] for number in range(frames)]
+        return [before and behind for before, behind in itertools.pairwise(own)]
 
 
 @contextmanager
