@@ -18,7 +18,7 @@ def checked_seeds(where: str, name: str, arguments: Mapping[str, Any]) -> list[i
     seed, num_clouds = arguments[name], len(arguments["ptr"]) - 1
     given = seed.tolist() if isinstance(seed, Tensor) else seed
     seeds = list(given) if isinstance(given, Sequence) else [given] * num_clouds
-    if not all(isinstance(one, int) for one in seeds):
+    if not all(isinstance(one, int) and not isinstance(one, bool) for one in seeds):
         raise DTypeError(f"{where}: seed must be an int, or a sequence or tensor of ints, got {given}")
     if len(seeds) != num_clouds:
         raise ShapeError(f"{where}: {len(seeds)} seeds were given for {num_clouds} clouds")

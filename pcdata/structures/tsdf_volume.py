@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, get_args
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
@@ -131,6 +132,8 @@ class TSDFVolume:
             ConfigError: ``num_bytes`` is not a whole number of at least 1.
             VolumeTooLargeError: it is more than ``max_bytes``, or than the device has.
         """
+        if isinstance(num_bytes, np.integer):  # such as a sum of NumPy's
+            num_bytes = int(num_bytes)
         if type(num_bytes) is not int or num_bytes < 1:
             raise ConfigError(f"TSDFVolume.reserve: num_bytes must be a whole number from 1 on, got {num_bytes!r}")
         if num_bytes > self.max_bytes:

@@ -15,7 +15,8 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from random import getstate
-from typing import Any, NamedTuple, NoReturn
+from types import CodeType
+from typing import Any, NoReturn
 
 import torch
 from numpy.random import get_state
@@ -65,9 +66,9 @@ def check_class(cls: type[nn.Module]) -> None:
     for hook, arguments in _HOOKS.items():
         if hook in own and callable(own[hook]) and not _takes(own[hook], None, None, None):
             raise ConfigError(f"{name}.{hook}: is called with two arguments; write\n    def {hook}(self, {arguments}):")
-    if "pick" in own and not (decides := _decides(cls)).calls & {"pick", "make_params"}:
+    if "pick" in own and (decides := _decides_without_picking(cls)) is not None:
         raise ConfigError(
-            f"{name}.pick: is never called, as {decides.name}.make_params decides which rows stay; write that instead\n"
+            f"{name}.pick: is never called, as {decides}.make_params decides which rows stay; write that instead\n"
             "    def make_params(self, data, streams):"
         )
     if "forward" in own and not _takes(own["forward"], None, None, generator=None):
@@ -90,15 +91,25 @@ def check_class(cls: type[nn.Module]) -> None:
             raise ConfigError(f"{name}.{field}: every step has something of this name; call the field otherwise{hint}")
 
 
-class _Decides(NamedTuple):
-    name: str  # of the class whose make_params runs
-    calls: set[str]  # what it looks up
+def _decides_without_picking(cls: type[nn.Module]) -> str | None:
+    """Return the class of pcdata whose ``make_params`` decides for a new step, if nothing there looks up ``pick``."""
+    decides = next(base for base in cls.__mro__ if "make_params" in vars(base))
+    if not decides.__module__.startswith("pcdata.") or not any("pick" in vars(base) for base in cls.__mro__[1:]):
+        return None
+    written = [made for name, made in vars(cls).items() if name != "pick"]
+    looked_up = _looked_up(vars(decides)["make_params"]).union(*map(_looked_up, written))
+    return None if looked_up & {"pick", "make_params"} else decides.__name__
 
 
-def _decides(cls: type[nn.Module]) -> _Decides:
-    base = next(base for base in cls.__mro__ if "make_params" in vars(base))
-    code = getattr(inspect.unwrap(vars(base)["make_params"]), "__code__", None)
-    return _Decides(base.__name__, {"pick"} if code is None else set(code.co_names))
+def _looked_up(function: Any) -> set[str]:
+    code = getattr(inspect.unwrap(function), "__code__", None) if callable(function) else None
+    found: set[str] = set()
+    waiting = [] if code is None else [code]
+    while waiting:
+        code = waiting.pop()
+        found.update(code.co_names)
+        waiting += [one for one in code.co_consts if isinstance(one, CodeType)]
+    return found
 
 
 def _takes(function: Callable[..., Any], *args: Any, **kwargs: Any) -> bool:

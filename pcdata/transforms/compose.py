@@ -165,9 +165,9 @@ class Compose(Transform):
             is_own = False
             if position >= singly and isinstance(data, PointCloud):
                 singly = position + selections_from(steps, position)
-                cloud = _selected(steps, range(position, singly), data, told)
-                if cloud is not None:
-                    data, position = cloud, singly
+                selected = _selected(steps, range(position, singly), data, told)
+                if selected is not None:
+                    data, position = selected
                     continue
             data, generator = _step(steps[position], data, generator)
             position += 1
@@ -351,12 +351,13 @@ def _begun(steps: Sequence[Transform], beginning: slice, data: Data, told: Told)
     told(range(beginning.start, beginning.stop), cloud)
     if aside is None:
         return cloud, beginning.stop, beginning.stop
-    left = run_selections(steps, range(beginning.stop, stop), cloud, aside, told)
-    return (aside.back(cloud), beginning.stop, stop) if left is None else (left, stop, stop)
+    return *run_selections(steps, range(beginning.stop, stop), cloud, aside, told), stop
 
 
-def _selected(steps: Sequence[Transform], positions: range, cloud: PointCloud, told: Told) -> PointCloud | None:
-    """Run selections together; None where there are not two, or they must be run one by one."""
+def _selected(
+    steps: Sequence[Transform], positions: range, cloud: PointCloud, told: Told
+) -> tuple[PointCloud, int] | None:
+    """Run selections together; return also the next step. None where there are not two to be run so."""
     if len(positions) < 2:
         return None
     together = steps[positions.start : positions.stop]

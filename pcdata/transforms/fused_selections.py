@@ -110,24 +110,28 @@ def run_selections(
     cloud: PointCloud,
     aside: SetAside | None,
     told: Callable[[range, PointCloud], None],
-) -> PointCloud | None:
-    """Run the steps at some positions, which :func:`selections_from` found; None where one refuses.
+) -> tuple[PointCloud, int]:
+    """Run the steps at some positions, which :func:`selections_from` found; return what is left, and where they stop.
 
-    ``told`` is called behind each that picks rows, with the positions of those that this is for and with what they
-    left, without the fields that are set aside.
+    That is behind the last, or at one that refuses: run by itself it says why. ``told`` is called behind each that
+    picks rows, with the positions of those that this is for and with what they left, without the fields set aside.
     """
     chosen: Params | None = None  # decided, and not picked yet
-    start = positions.start
-    try:
-        for position in positions:
-            behind = steps[position + 1] if position + 1 < positions.stop else None
+    start, stop = positions.start, positions.stop
+    for position in positions:
+        behind = steps[position + 1] if position + 1 < positions.stop else None
+        try:
             cloud, chosen = _run(steps[position], cloud, chosen, behind)
-            if chosen is None:
-                told(range(start, position + 1), cloud)
-                start = position + 1
-    except (PcdataError, Warning):  # a warning may be an error to the caller
-        return None  # the step that refuses says why
-    return cloud if aside is None else aside.back(cloud)
+        except (PcdataError, Warning):  # a warning may be an error to the caller
+            stop = position
+            break
+        if chosen is None:
+            told(range(start, position + 1), cloud)
+            start = position + 1
+    if chosen is not None:
+        cloud = cloud.select(chosen["index"], chosen["ptr"])
+        told(range(start, stop), cloud)
+    return (cloud if aside is None else aside.back(cloud)), stop
 
 
 def _run(

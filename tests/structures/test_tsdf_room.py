@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -60,7 +61,7 @@ def test_reserving_changes_no_bit(amounts, when):
 def test_what_is_stored_is_not_moved():
     volume = volume_of(FRAMES[0])
     start = volume.blocks.chunks[0]["tsdf"].data_ptr()
-    volume.reserve(200 * MIB)
+    volume.reserve(np.int64(200 * MIB))
     volume.integrate(FRAMES[1])
     assert volume.blocks.chunks[0]["tsdf"].data_ptr() == start
 

@@ -145,12 +145,24 @@ def test_a_class_that_no_chain_could_run_is_refused_where_it_is_written(body, wh
         written("T.Transform", body)
 
 
-@pytest.mark.parametrize("base", ["T.CropWorkspace", "T.Transform"])
+@pytest.mark.parametrize("base", ["T.CropWorkspace", "T.RemovePlane"])
 def test_a_pick_that_nothing_calls_is_refused_where_it_is_written(base):
     with pytest.raises(
         ConfigError, match=r"^Mine\.pick: is never called, as (\w+)\.make_params decides .*(.|\n)*def make_"
     ):
         written(base, "def pick(self, cloud, streams):\n    return cloud.ptr, cloud.ptr")
+
+
+@pytest.mark.parametrize(
+    ("base", "body"),
+    [
+        ("T.Transform", "def transform(self, data, params):\n    return self.pick(data, None)"),
+        ("T.RemovePlane", "def _found(self, data):\n    return [self.pick(one, None) for one in data.unbatch()]"),
+        ("T.CropWorkspace", "def make_params(self, data, streams):\n    return getattr(self, 'pick')(data, streams)"),
+    ],
+)
+def test_a_pick_that_somebody_calls_is_left_alone(base, body):
+    written(base, body + "\n" + "def pick(self, cloud, streams):\n    return cloud")
 
 
 @pytest.mark.parametrize("base", ["T.RemoveRadiusOutliers", "T.RemoveStatisticalOutliers", "T.RemoveDuplicates"])

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pcdata.contracts.dispatch import why_unavailable
-from pcdata.errors import ConfigError
+from pcdata.errors import ConfigError, TooFewPointsError
 from pcdata.functional.rows import pick_rows, ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import DepthFrame, Kind, PointCloud
@@ -147,10 +147,10 @@ def together(monkeypatch) -> list[list[str]]:
     found: list[list[str]] = []
 
     def noted(steps, positions, *others):
-        cloud = fused.run_selections(steps, positions, *others)
-        if cloud is not None:
+        cloud, stop = fused.run_selections(steps, positions, *others)
+        if stop == positions.stop:
             found.append([type(steps[position]).__name__ for position in positions])
-        return cloud
+        return cloud, stop
 
     monkeypatch.setattr("pcdata.transforms.compose.run_selections", noted)
     return found
@@ -306,6 +306,28 @@ def test_a_warning_that_is_an_error_comes_from_the_step_itself(together):
     assert not together
     with pytest.warns(Warning, match="are removed"):
         assert_same(chain(FULL), chain(FULL))
+
+
+@pytest.mark.parametrize("given", ["capture", "cloud", "few points"])
+def test_what_ran_before_a_step_refuses_does_not_run_again(given):
+    steps = [
+        RemoveDuplicates(),
+        RemoveStatisticalOutliers(num_neighbors=5, std_ratio=0.5, max_drop=0.0, drop_alarm="warn"),
+        RemoveRadiusOutliers(radius=0.001, min_neighbors=50, max_drop=0.01),
+    ]
+    chain, data = Compose([Deproject(), CROP, *steps] if given == "capture" else steps), FULL
+    if given != "capture":
+        data = whole_cloud()
+    if given == "few points":
+        keep = torch.arange(data.num_points) % 9 == 0
+        data = data.select(keep, ptr_after_mask(keep, data.ptr))
+    heard = []
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always")
+        with pytest.raises(TooFewPointsError, match=r"^RemoveRadiusOutliers: (.|\n)*are removed"):
+            chain.run_in_passes(data, after=lambda positions, cloud: heard.extend(positions))
+    assert len(warned) == len({str(one.message) for one in warned}) == 2  # one for each cloud
+    assert heard == list(range(len(chain.steps) - 1))
 
 
 def test_a_subclass_or_a_hook_is_not_passed_over(together):
