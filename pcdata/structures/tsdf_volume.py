@@ -121,7 +121,7 @@ class TSDFVolume:
             tsdf.integrate_view(blocks, rows, view, self.grid, carve=self.carve != "never", backend=self.backend)
         self.num_views += len(views)
 
-    def reserve(self, num_bytes: int) -> None:
+    def reserve(self, num_bytes: int | np.integer[Any]) -> None:
         """Take memory for the volume now, so that frames which need no more of it never wait for the system.
 
         ``num_bytes`` counts all blocks, those that are there too, as :attr:`num_bytes` and :meth:`estimate_bytes` do;
