@@ -28,9 +28,6 @@ from torch import Tensor
 Arguments = tuple[tuple[Any, ...], dict[str, Any]]
 
 
-NO_RUNS = torch.zeros(3, dtype=torch.int64), torch.empty(8, 0)  # of two small clouds
-
-
 def _fields() -> dict[str, Tensor]:
     return {"points": points(90, 1), "labels": torch.arange(90), "byte": torch.arange(90).to(torch.uint8)}
 
@@ -116,11 +113,6 @@ def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
         lambda: ((points(90, 1), two, [poses(2), (seeds, 0.01, None), (seeds + 1, 0.02, 0.03)]), {}),
     )
     yield (
-        "random_rows",
-        "three",
-        lambda: ((torch.tensor([50, 0, 4000]), torch.tensor([7, 0, 3900]), torch.tensor([5, 6, 7])), {}),
-    )
-    yield (
         "random_order",
         "three",
         lambda: ((torch.tensor([50, 0, 4000]), torch.tensor([7, 0, 3900]), torch.tensor([5, 6, 7])), {}),
@@ -149,13 +141,10 @@ def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     searched = asked.pop("points"), asked.pop("ptr"), 5
     yield "nearest_chunks", "queries", lambda: (searched, asked)
     cloud, ptr, distance = CLOUDS["two"]()["points"], ptr_of(90, 36), 0.01
-    triples = torch.stack([torch.arange(90).reshape(30, 3) % count for count in (90, 36)])
     planes = torch.nn.functional.normalize(torch.randn(2, 30, 4, generator=seeded(4), dtype=torch.float64), dim=2)
     planes[:, :, 3] *= 0.1
-    yield "draw_planes", "two", lambda: ((cloud, ptr, triples, torch.tensor([0, 1])), {})
     competes, floors = planes[:, :, 0] < 0.9, torch.zeros(2, dtype=torch.int64)
-    yield "bound_runs", "small", lambda: ((cloud, ptr), {})
-    yield "record_planes", "two", lambda: ((cloud, ptr, NO_RUNS, planes, competes, distance, floors), {})
+    yield "record_planes", "two", lambda: ((cloud, ptr, planes, competes, distance, floors), {})
     yield "search_planes", "two", lambda: ((cloud, ptr, planes, competes, distance, 0.9, 0, 5), {})
     yield "near_planes", "two", lambda: ((cloud, ptr, planes[:, 0], distance), {})
     yield "fit_planes", "two", lambda: ((cloud, ptr, cloud[:, 2] > 0.05), {})

@@ -9,8 +9,8 @@ absent, and a slow one serves, a :class:`~pcdata.errors.SlowBackendWarning` says
 ``@inner`` marks what only pcdata itself calls, with tensors that it has checked already (picking rows, moving points):
 kernels register beside it in the same way, but there is no contract to check.
 
-A reference may leave its work to ``steps``, inner functions that it tells its ``backend``: a backend that has a kernel
-for every step then serves the operation without one of its own.
+A reference may leave its work to ``steps``, functions that it tells its ``backend``: a backend that serves every step
+then serves the operation without a kernel of its own.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class _Operation:
     contract: Contract | None = None  # None for an inner function
     gradient: bool = True  # whether results carry one to the inputs
     mutates: tuple[str, ...] = ()  # arguments that it changes in place
-    steps: tuple[str, ...] = ()  # inner functions that the reference tells its backend
+    steps: tuple[_Operation, ...] = ()  # that the reference calls with its backend
     kernels: dict[str, Callable[..., Any]] = field(default_factory=dict)
     roomy: set[str] = field(default_factory=set)  # backends whose kernel takes arrays with room: see kernel()
 
@@ -75,12 +75,17 @@ class _Operation:
         return backend == REFERENCE or backend in self.kernels or self.serves_by_steps(backend)
 
     def serves_by_steps(self, backend: str) -> bool:
-        """Say whether a backend has kernels of all steps: the reference then runs on it, gradients and all."""
-        return bool(self.steps) and all(backend in INNER[step].kernels for step in self.steps)
+        """Say whether a backend serves all steps: the reference then runs on it, gradients and all."""
+        return bool(self.steps) and all(backend in step.kernels or step.serves_by_steps(backend) for step in self.steps)
 
 
 OPERATIONS: dict[str, _Operation] = {}
 INNER: dict[str, _Operation] = {}
+
+
+def registered(name: str) -> _Operation:
+    """Return an operation or an inner function by its name."""
+    return OPERATIONS.get(name) or INNER[name]
 
 
 def op(
@@ -99,7 +104,7 @@ def op(
     Args:
         gradient: whether results carry one to the inputs; with False no body ever sees a tensor that requires one.
         mutates: arguments that it changes in place, to the same values on every backend; all others stay as they are.
-        steps: inner functions that the reference calls with its ``backend``.
+        steps: functions that the reference calls with its ``backend``.
         traced: how a compiler keeps it whole; None = a compiled program is cut where it calls the operation.
         specs: argument name -> contract: of tensors a string, see :mod:`pcdata.contracts.tensors`; of others a
             function, see :mod:`pcdata.contracts.numbers`.
@@ -137,7 +142,7 @@ def op(
             for key, one in inspect.signature(reference).parameters.items()
         }
         operation = OPERATIONS[name] = _Operation(
-            name, reference, public, contract, gradient, mutates, tuple(step.__name__ for step in steps)
+            name, reference, public, contract, gradient, mutates, tuple(registered(step.__name__) for step in steps)
         )
         return public
 
@@ -183,10 +188,10 @@ def kernel(name: str, backend: str, *, roomy: bool = False) -> Callable[[Callabl
     """
 
     def decorate(body: Callable[P, R]) -> Callable[P, R]:
-        registry = OPERATIONS if name in OPERATIONS else INNER
-        registry[name].kernels[backend] = body
+        operation = registered(name)
+        operation.kernels[backend] = body
         if roomy:
-            registry[name].roomy.add(backend)
+            operation.roomy.add(backend)
         return body
 
     return decorate
@@ -197,7 +202,7 @@ def roomy_body(name: str, device: torch.device) -> Callable[..., Any] | None:
 
     It gets what :func:`op` would have checked, and nobody checks it.
     """
-    operation = OPERATIONS.get(name) or INNER[name]
+    operation = registered(name)
     backend = first_live(device, operation.serves)
     return operation.kernels[backend] if backend in operation.roomy else None
 

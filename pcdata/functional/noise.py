@@ -106,7 +106,6 @@ def move_points(
     return before.copy_(points) if in_place else points
 
 
-@inner
 def random_rows(counts: Tensor, wanted: Tensor, seeds: Tensor) -> Tensor:
     """Return a (N,) bool mask with ``wanted`` (B,) rows of each cloud, every choice as likely as any other; on the CPU.
 

@@ -17,14 +17,7 @@ from pcdata.functional.clusters import density_clusters
 from pcdata.functional.neighbors import nearest_rows
 from pcdata.functional.plane_arguments import checked_probability, checked_seeds, checked_tilt, checked_up
 from pcdata.functional.plane_choice import chosen_plane
-from pcdata.functional.plane_steps import (
-    bound_runs,
-    draw_planes,
-    near_planes,
-    record_planes,
-    refine_planes,
-    search_planes,
-)
+from pcdata.functional.plane_steps import near_planes, refine_planes
 from pcdata.functional.planes import ransac_plane
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.functional.voxels import voxel_downsample
@@ -46,7 +39,7 @@ _MOST_SPAN = 1e6
     probability=checked_probability,
     max_planes=checked_count,
     min_share=checked_fraction,
-    steps=(draw_planes, bound_runs, record_planes, search_planes, refine_planes),
+    steps=(ransac_plane,),
     gradient=False,
 )
 def segment_planes(
@@ -130,16 +123,7 @@ def segment_planes(
     min_share=checked_fraction,
     likely_up=checked_up,
     viewpoint=checked_places,
-    steps=(
-        draw_planes,
-        bound_runs,
-        record_planes,
-        search_planes,
-        refine_planes,
-        near_planes,
-        nearest_rows,
-        density_clusters,
-    ),
+    steps=(segment_planes, refine_planes, near_planes, nearest_rows, density_clusters),
     gradient=False,
 )
 def supporting_plane(

@@ -1,4 +1,7 @@
-"""The steps of a search for planes that touch every point, for all clouds at once."""
+"""The steps of a search for planes that touch every point, for all clouds at once.
+
+The compiled core counts and searches within its body of ``ransac_plane``; it refines, marks and fits on its own too.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,7 @@ from pcdata.contracts.dispatch import REFERENCE, inner
 from pcdata.contracts.host import differing
 from pcdata.contracts.on_host import bounds_of
 from pcdata.functional.rows import count_per_cloud, counts_from_ptr, ptr_from_counts
-from pcdata.geometry.plane_fit import fit_plane, plane_distance, planes_through
+from pcdata.geometry.plane_fit import fit_plane, plane_distance
 from pcdata.geometry.rigid import angle_between
 from pcdata.threads import at_once
 
@@ -25,25 +28,9 @@ _FIRST_TRIES = 64
 
 
 @inner
-def draw_planes(
-    points: Tensor, ptr: Tensor, triples: Tensor, which: Tensor, *, backend: str = "auto"
-) -> Tensor:  # (B, P, 4) float64 on the CPU, as planes_through
-    """Return the planes through triples (T, P, 3) of rows within a cloud; ``which`` (B,) of the T each cloud takes."""
-    rows = triples[which] + ptr[:-1].cpu()[:, None, None]
-    return planes_through(points[rows.to(points.device)].cpu())
-
-
-@inner
-def bound_runs(points: Tensor, ptr: Tensor, *, backend: str = "auto") -> tuple[Tensor, ...]:
-    """Return what a backend likes to know of the points before it counts those near planes again and again."""
-    return ()
-
-
-@inner
 def record_planes(
     points: Tensor,
     ptr: Tensor,
-    runs: tuple[Tensor, ...],  # of bound_runs
     planes: Tensor,  # (B, P, 4)
     competes: Tensor,  # (B, P) bool: the others are not looked at
     distance: float,
@@ -82,7 +69,7 @@ def search_planes(
     while first < tries and bool((last > first).any()):
         some = slice(first, min(first + block, tries))
         part, asked = planes[:, some].contiguous(), competes[:, some] & (last > first)
-        counts[:, some] = record_planes(points, ptr, (), part, asked, distance, floors, backend=REFERENCE)
+        counts[:, some] = record_planes(points, ptr, part, asked, distance, floors, backend=REFERENCE)
         best = torch.maximum(counts[:, some].cummax(1).values, floors[:, None])
         needed = tries_needed(best, sizes, probability)
         drawn = torch.arange(first + 1, some.stop + 1, dtype=torch.float64, device="cpu") - not_drawn
@@ -123,15 +110,9 @@ def spread_points(points: Tensor, ptr: Tensor, bits: int) -> tuple[Tensor, Tenso
 
 @inner
 def near_planes(
-    points: Tensor,
-    ptr: Tensor,
-    planes: Tensor,
-    distance: float,
-    runs: tuple[Tensor, ...] = (),
-    *,
-    backend: str = "auto",
+    points: Tensor, ptr: Tensor, planes: Tensor, distance: float, *, backend: str = "auto"
 ) -> Tensor:  # (N,) bool
-    """Mark the points that are near their cloud's plane, planes (B, 4); ``runs`` as bound_runs gives them."""
+    """Mark the points that are near their cloud's plane, planes (B, 4)."""
     bounds = pairwise(bounds_of(ptr))
     near = [
         plane_distance(points[start:stop], plane[None])[0].abs_() < distance
@@ -156,7 +137,6 @@ def refine_planes(
     distance: float,
     ups: Tensor | None,  # (B, 3) unit vectors on the CPU
     max_tilt: float | None,
-    runs: tuple[Tensor, ...] = (),  # of bound_runs, if they are known
     *,
     backend: str = "auto",
 ) -> tuple[Tensor, Tensor]:  # planes (B, 4) on the CPU, inliers (N,)

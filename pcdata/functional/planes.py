@@ -18,16 +18,9 @@ from pcdata.functional.plane_arguments import (
     checked_tilt,
     checked_up,
 )
-from pcdata.functional.plane_steps import (
-    bound_runs,
-    draw_planes,
-    record_planes,
-    refine_planes,
-    search_planes,
-    within_tilt,
-)
+from pcdata.functional.plane_steps import record_planes, refine_planes, search_planes, within_tilt
 from pcdata.functional.row_draws import draw_rows
-from pcdata.geometry.plane_fit import through_origin
+from pcdata.geometry.plane_fit import planes_through, through_origin
 from pcdata.rng import seeded
 
 # Points that hypotheses are scored on where they need not be the best of all: their shares are off by 0.4 % or less.
@@ -46,7 +39,7 @@ MOST_HYPOTHESES = 1 << 20
     max_tilt=checked_tilt,
     probability=checked_probability,
     guess=checked_guess,
-    steps=(draw_planes, bound_runs, record_planes, search_planes, refine_planes),
+    steps=(record_planes, search_planes, refine_planes),
     gradient=False,
 )
 def ransac_plane(
@@ -104,20 +97,17 @@ def ransac_plane(
     # Hypotheses of many clouds at a time, so that memory does not grow with their number.
     at_once = max(1, MOST_HYPOTHESES // num_hypotheses)
     winners = []
-    runs: tuple[Tensor, ...] = ()
     for first in range(0, num_clouds, at_once):
         some = slice(first, min(first + at_once, num_clouds))
         own, own_ptr = clouds_between(points, ptr, some.start, some.stop)
-        triples, which = _draw_triples(counts[some], num_hypotheses, seed[some])
-        hypotheses = draw_planes(own, own_ptr, triples, which, backend=backend)
+        hypotheses = _draw_planes(own, own_ptr, counts[some], num_hypotheses, seed[some])
         if guess is not None:
             hypotheses = torch.cat([guess[some, None], hypotheses], 1)
         is_plane = ~hypotheses[..., 0].isnan()
         competes = is_plane & within_tilt(hypotheses, None if up is None else up[some, None], max_tilt)
-        runs = bound_runs(own, own_ptr, backend=backend)
         if probability is None:
             floors = torch.zeros(len(own_ptr) - 1, dtype=torch.int64, device="cpu")
-            near = record_planes(own, own_ptr, runs, hypotheses, competes, distance, floors, backend=backend)
+            near = record_planes(own, own_ptr, hypotheses, competes, distance, floors, backend=backend)
         else:
             search = distance, probability, hypotheses.shape[1] - num_hypotheses
             near = search_planes(own, own_ptr, hypotheses, competes, *search, SCORED_BITS, backend=backend)
@@ -125,17 +115,16 @@ def ransac_plane(
                 alone = *clouds_between(own, own_ptr, b, b + 1), hypotheses[b : b + 1], competes[b : b + 1]
                 near[b] = search_planes(*alone, *search, _ALL_BITS, backend=backend)[0]
         winners.append(_best_planes(hypotheses, is_plane, competes, near, distance, first))
-    runs = runs if at_once >= num_clouds else ()  # of all clouds
-    planes, inliers = refine_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, runs, backend=backend)
+    planes, inliers = refine_planes(points, ptr, torch.cat(winners), distance, up, max_tilt, backend=backend)
     return face_planes(planes, up, distance).to(points.device), inliers
 
 
-def _draw_triples(counts: list[int], num_hypotheses: int, seeds: list[int]) -> tuple[Tensor, Tensor]:
-    """Draw the triples of every cloud, (T, P, 3) int64, and say which each takes, (B,): equal clouds share a draw."""
-    number: dict[tuple[int, int], int] = {}
-    which = [number.setdefault(draw, len(number)) for draw in zip(counts, seeds)]
-    drawn = [draw_rows(count, 3, num_hypotheses, seeded(seed)) for count, seed in number]
-    return torch.stack(drawn), torch.tensor(which, dtype=torch.int64, device="cpu")
+def _draw_planes(points: Tensor, ptr: Tensor, counts: list[int], num_hypotheses: int, seeds: list[int]) -> Tensor:
+    """Return planes through random triples of each cloud's points, (B, P, 4) float64 on the CPU, as planes_through."""
+    asked = list(zip(counts, seeds))
+    drawn = {key: draw_rows(key[0], 3, num_hypotheses, seeded(key[1])) for key in set(asked)}
+    rows = torch.stack([drawn[key] for key in asked]) + ptr[:-1].cpu()[:, None, None]
+    return planes_through(points[rows.to(points.device)].cpu())
 
 
 def _best_planes(

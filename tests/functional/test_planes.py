@@ -108,7 +108,7 @@ def test_among_equal_hypotheses_the_earliest_wins():
     hypotheses = torch.tensor([[0.0, 0, 1, 0.4], [0.0, 0, 1, 0.501], [0.0, 0, 1, 0.499]], dtype=torch.float64)
     allowed = torch.ones(1, 3, dtype=torch.bool)
     ptr, none = torch.tensor([0, 50]), torch.zeros(1, dtype=torch.int64)
-    near = plane_steps.record_planes(points, ptr, (), hypotheses[None], allowed, 0.01, none, backend="torch")
+    near = plane_steps.record_planes(points, ptr, hypotheses[None], allowed, 0.01, none, backend="torch")
     assert near.tolist() == [[0, 50, 0]]
     best = planes_module._best_planes(hypotheses[None], allowed, allowed, near, 0.01, 0)
     assert torch.equal(best, hypotheses[1:2])

@@ -299,7 +299,7 @@ def _neighbors(
     call(
         "pc_neighbors",
         *(points, ptr, len(ptr) - 1, queries, queries_ptr, k, *_limits(radius)),
-        *(*_grid_arguments(grid), index, distance, None),
+        *(*_grid_arguments(grid), index, distance),
     )
     return index, distance
 

@@ -67,14 +67,6 @@ def _run(
     )
 
 
-@kernel("random_rows", "cpu")
-def random_rows(counts: Tensor, wanted: Tensor, seeds: Tensor) -> Tensor:
-    """Draw until there are enough."""
-    mask = room(int(counts.sum()), torch.bool)
-    call("pc_random_rows", len(counts), counts.contiguous(), wanted.contiguous(), seeds.contiguous(), mask)
-    return mask
-
-
 @kernel("random_order", "cpu")
 def random_order(counts: Tensor, wanted: Tensor, seeds: Tensor) -> Tensor:
     """Sort cloud by cloud; of a cloud of which few are wanted, those alone that may come first."""

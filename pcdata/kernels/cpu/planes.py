@@ -1,9 +1,8 @@
-"""The search for planes, all of it in one call, and its steps; and where the surface in a plane ends."""
+"""The search for planes in one call, planes through what is near or chosen, and where the surface in a plane ends."""
 
 from __future__ import annotations
 
 import math
-from itertools import accumulate, pairwise
 
 import torch
 from torch import Tensor
@@ -17,9 +16,6 @@ from pcdata.functional.row_draws import words_of_clouds
 from pcdata.functional.rows import first_per_cloud
 from pcdata.geometry.plane_fit import FLAT, plane_of_moments
 from pcdata.kernels.cpu.native import call, room
-
-# What pc_bound_runs looks at: points of a run, and runs that fit a register; smaller clouds it leaves alone.
-_RUN, _RUNS_AT_ONCE, _SMALL_CLOUD = 64, 16, 8192
 
 
 @kernel("ransac_plane", "cpu")
@@ -54,90 +50,23 @@ def ransac_plane(
     return planes, near
 
 
-@kernel("draw_planes", "cpu")
-def draw_planes(points: Tensor, ptr: Tensor, triples: Tensor, which: Tensor) -> Tensor:
-    """Make the planes of all clouds in one pass."""
-    planes = room((len(which), triples.shape[1], 4), torch.float64)
-    call("pc_planes_of_triples", points, ptr, len(which), triples, triples.shape[1], which, FLAT, planes)
-    return planes
-
-
-@kernel("bound_runs", "cpu")
-def bound_runs(points: Tensor, ptr: Tensor) -> tuple[Tensor, ...]:
-    """Look at 64 points that follow each other at a time, where that is worth it: in large clouds."""
-    counts = [stop - start for start, stop in pairwise(ptr.tolist())]
-    if max(counts, default=0) <= _SMALL_CLOUD:
-        return ()
-    points_at_once = _RUN * _RUNS_AT_ONCE
-    runs = [-(-count // points_at_once) * _RUNS_AT_ONCE if count > _SMALL_CLOUD else 0 for count in counts]
-    run_ptr = torch.tensor([0, *accumulate(runs)], dtype=torch.int64, device="cpu")
-    facts = room((8, sum(runs)), torch.float32)
-    call("pc_bound_runs", points, ptr, len(counts), run_ptr, facts)
-    return run_ptr, facts
-
-
-@kernel("record_planes", "cpu")
-def record_planes(
-    points: Tensor,
-    ptr: Tensor,
-    runs: tuple[Tensor, ...],
-    planes: Tensor,
-    competes: Tensor,
-    distance: float,
-    floors: Tensor,
-) -> Tensor:
-    """Look at runs of points first: they tell of most planes that they are no records, and of most points."""
-    counts = room(planes.shape[:2], torch.int64)
-    count, some, known = len(planes), planes.shape[1], runs or (None, None)
-    call(
-        "pc_record_planes", points, ptr, count, *known, planes.float(), competes, some, float(distance), floors, counts
-    )  # fmt: skip
-    return counts
-
-
-@kernel("search_planes", "cpu")
-def search_planes(
-    points: Tensor,
-    ptr: Tensor,
-    planes: Tensor,
-    competes: Tensor,
-    distance: float,
-    probability: float,
-    not_drawn: int,
-    bits: int,
-) -> Tensor:
-    """Count some planes at a time on points that stay in the processor's cache."""
-    counts, missed = room(planes.shape[:2], torch.int64), math.log1p(-probability)
-    some = planes.float(), competes.contiguous(), planes.shape[1], float(distance), missed, not_drawn, counts
-    call("pc_search_planes", points, ptr, len(planes), bits, *some)
-    return counts
-
-
 @kernel("near_planes", "cpu")
-def near_planes(points: Tensor, ptr: Tensor, planes: Tensor, distance: float, runs: tuple[Tensor, ...] = ()) -> Tensor:
-    """Mark in one pass, runs of points at once where they are known."""
+def near_planes(points: Tensor, ptr: Tensor, planes: Tensor, distance: float) -> Tensor:
+    """Mark in one pass."""
     near = room(len(points), torch.bool)
-    known = runs or (None, None)
-    call("pc_near_planes", points, ptr, len(planes), *known, planes.float(), float(distance), near)
+    call("pc_near_planes", points, ptr, len(planes), planes.float(), float(distance), near)
     return near
 
 
 @kernel("refine_planes", "cpu")
 def refine_planes(
-    points: Tensor,
-    ptr: Tensor,
-    planes: Tensor,
-    distance: float,
-    ups: Tensor | None,
-    max_tilt: float | None,
-    runs: tuple[Tensor, ...] = (),
+    points: Tensor, ptr: Tensor, planes: Tensor, distance: float, ups: Tensor | None, max_tilt: float | None
 ) -> tuple[Tensor, Tensor]:
     """Look again at those runs of points alone that the last step of a plane may have changed."""
     refined, near = planes.clone(), room(len(points), torch.bool)
-    known = runs or (None, None)
     up, tilt = (None, 0.0) if ups is None or max_tilt is None else (ups.contiguous(), max_tilt)
-    arrays = points, ptr, len(planes), *known, float(distance), up, tilt, FLAT, MAX_REFINEMENTS, refined, near
-    call("pc_refine_planes", *arrays)
+    rules = float(distance), up, tilt, FLAT, MAX_REFINEMENTS
+    call("pc_refine_planes", points, ptr, len(planes), *rules, refined, near)
     return refined, near
 
 

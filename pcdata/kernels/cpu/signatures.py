@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x2C581A01EDE3E89
+INTERFACE_NUMBER = 0x45E45FAD1E92B33
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -41,7 +41,6 @@ pc_draw_motions: int64* keys, int64 num_clouds, double* draws, int64 num_draws, 
 pc_led_back: double* matrices, int64 num_steps, int64 num_clouds, double* source_from_cloud, double* result, int64*
     possible
 pc_are_plain_motions: double* matrices, int64 count, int64* plain
-pc_random_rows: int64 num_clouds, int64* counts, int64* wanted, int64* seeds, uint8* mask
 pc_random_order: int64 num_clouds, int64* counts, int64* wanted, int64* seeds, int64* rows
 pc_dropped_rows: int64* keys, int64* ptr, int64 num_clouds, double low, double high, uint8* mask, int64* kept_ptr
 pc_inside_box: float* points, int64 rows, float* lower, float* upper, uint8* inside, int64* finite
@@ -89,7 +88,7 @@ pc_sample_image: uint8* whole, float* real, int64 views, int64 height, int64 wid
 pc_sample_depth: float* depth, int64 views, int64 height, int64 width, double* places, int64 out_pixels, int64 surface,
     double max_jump, float* sampled, int64* pixel_index
 pc_neighbors: float* points, int64* ptr, int64 num_clouds, float* queries, int64* queries_ptr, int64 k, double limit,
-    float* limits, int64* pixel, int64 width, double* camera, int64* index, float* distance, int64* count
+    float* limits, int64* pixel, int64 width, double* camera, int64* index, float* distance
 pc_wide_neighbors: float* points, int64* ptr, int64 num_clouds, int64 width, float* queries, int64* queries_ptr, int64
     k, double limit, int64 norm, int64* index, float* distance
 pc_index_points: float* points, int64* ptr, int64 num_clouds, int64 copies, float* leaves, int64* leaf_ptr, float*
@@ -117,17 +116,9 @@ pc_voxel_downsample: float* points, int64* ptr, int64 num_clouds, double* sizes,
     inverse, int64* members, int64* counts, int64* spans_too_many
 pc_find_voxel_sizes: float* points, int64* ptr, int64 num_clouds, int64 num_points, double tolerance, double* sizes,
     int64* possible
-pc_planes_of_triples: float* points, int64* ptr, int64 num_clouds, int64* triples, int64 count, int64* which, double
-    flat, double* planes
-pc_bound_runs: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs
-pc_record_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, float* planes, uint8*
-    competes, int64 num_planes, double distance, int64* floors, int64* counts
-pc_search_planes: float* points, int64* ptr, int64 num_clouds, int64 bits, float* planes, uint8* competes, int64
-    num_planes, double distance, double missed, int64 not_drawn, int64* counts
-pc_near_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, float* planes, double
-    distance, uint8* near
-pc_refine_planes: float* points, int64* ptr, int64 num_clouds, int64* run_ptr, float* runs, double distance, double* up,
-    double max_tilt, double flat, int64 rounds, double* planes, uint8* near
+pc_near_planes: float* points, int64* ptr, int64 num_clouds, float* planes, double distance, uint8* near
+pc_refine_planes: float* points, int64* ptr, int64 num_clouds, double distance, double* up, double max_tilt, double
+    flat, int64 rounds, double* planes, uint8* near
 pc_ransac_planes: float* points, int64* ptr, int64 num_clouds, int64* words, int64 num_draws, int64* which, double*
     guess, double* up, double max_tilt, double distance, double missed, int64 bits, double flat, int64 rounds, double*
     planes, uint8* near, int64* found

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 import pcdata.functional.planes  # noqa: F401 - the functions must be registered before their kernels
-from pcdata.contracts.dispatch import INNER, kernel
+from pcdata.contracts.dispatch import kernel
 from pcdata.functional.plane_steps import MAX_REFINEMENTS, spread_points, tries_needed, within_tilt
 from pcdata.functional.rows import cloud_of_rows, counts_from_ptr
 from pcdata.geometry.plane_fit import plane_of_moments
@@ -18,28 +16,9 @@ _ROWS_OF_A_BLOCK = 2048
 SUMS = 12  # kPlaneSums of the kernel
 
 
-@kernel("draw_planes", "cuda")
-def draw_planes(*arguments: Any) -> Tensor:
-    """Leave the few points of the triples to the host, which draws them."""
-    planes: Tensor = INNER["draw_planes"].reference(*arguments)
-    return planes
-
-
-@kernel("bound_runs", "cuda")
-def bound_runs(points: Tensor, ptr: Tensor) -> tuple[Tensor, ...]:
-    """Look at every point: the device is fast enough."""
-    return ()
-
-
 @kernel("record_planes", "cuda")
 def record_planes(
-    points: Tensor,
-    ptr: Tensor,
-    runs: tuple[Tensor, ...],
-    planes: Tensor,
-    competes: Tensor,
-    distance: float,
-    floors: Tensor,
+    points: Tensor, ptr: Tensor, planes: Tensor, competes: Tensor, distance: float, floors: Tensor
 ) -> Tensor:
     """Count for all planes at once; the one wait is for their counts."""
     clouds, some = competes.shape
@@ -70,7 +49,7 @@ def search_planes(
     """Count for all planes at once, which costs less than a second wait, and forget those behind the last try."""
     points, ptr = spread_points(points, ptr, bits)
     floors = torch.zeros(len(planes), dtype=torch.int64, device="cpu")
-    counts = record_planes(points, ptr, (), planes, competes, distance, floors)
+    counts = record_planes(points, ptr, planes, competes, distance, floors)
     sizes = counts_from_ptr(ptr).cpu()[:, None].double()
     drawn = torch.arange(1, planes.shape[1] + 1, dtype=torch.float64, device="cpu") - not_drawn
     is_enough = drawn >= tries_needed(counts.cummax(1).values, sizes, probability)
@@ -79,13 +58,7 @@ def search_planes(
 
 @kernel("refine_planes", "cuda")
 def refine_planes(
-    points: Tensor,
-    ptr: Tensor,
-    planes: Tensor,
-    distance: float,
-    ups: Tensor | None,
-    max_tilt: float | None,
-    runs: tuple[Tensor, ...] = (),
+    points: Tensor, ptr: Tensor, planes: Tensor, distance: float, ups: Tensor | None, max_tilt: float | None
 ) -> tuple[Tensor, Tensor]:
     """Mark and sum up in one kernel, one wait a round; the fits are the reference's, from moments."""
     points, ptr, planes = points.contiguous(), ptr.contiguous(), planes.clone()

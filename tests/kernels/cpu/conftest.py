@@ -7,9 +7,12 @@ import dataclasses
 import functools
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 from torch import Tensor
 
 from pcdata.contracts.dispatch import OPERATIONS, REFERENCE, _Operation, why_unavailable
@@ -103,3 +106,32 @@ def references() -> Iterator[None]:
                 else:
                     patch.setitem(operation.kernels, name, instead)
         yield
+
+
+@pytest.fixture(params=[(1, None), (7, None), *((2, name) for name in native.INSTRUCTION_SETS)], ids=str)
+def machine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A number of threads, and the library of one instruction set (None: the best)."""
+    threads, name = request.param
+    if name is not None:
+        monkeypatch.setenv(native.FORCE_VARIABLE, name)
+        native.library.cache_clear()
+        try:
+            native.library()
+        except OSError as error:
+            pytest.skip(str(error))
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    yield
+    torch.set_num_threads(before)
+    if name is not None:
+        monkeypatch.undo()
+        native.library.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def frame(test_data: Path) -> tuple[Tensor, Tensor]:
+    """Depth (1, H, W) metres and intrinsics of a real frame."""
+    depth = np.array(pytest.importorskip("PIL.Image").open(test_data / "graspnet_frame/depth.png"))
+    meta = pytest.importorskip("scipy.io").loadmat(test_data / "graspnet_frame/meta.mat")
+    metres = torch.from_numpy(depth.astype(np.float32) / 1000)[None]
+    return metres, torch.from_numpy(meta["intrinsic_matrix"].astype(np.float64))[None]

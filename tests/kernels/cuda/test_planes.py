@@ -43,7 +43,7 @@ def test_counts_of_any_number_of_planes(num_planes, ordered):
     planes = torch.nn.functional.normalize(torch.randn(2, num_planes, 4, generator=seeded(4)), dim=2).double()
     planes[:, ::3] = torch.tensor([0.0995, 0, -0.995, 1.194], dtype=torch.float64)
     competes = torch.rand(2, num_planes, generator=seeded(5)) < 0.8
-    arguments = points, ptr, (), planes, competes, 0.05, torch.tensor([3, 0])
+    arguments = points, ptr, planes, competes, 0.05, torch.tensor([3, 0])
     found = INNER["record_planes"].kernels[harness.BACKEND](*arguments)
     assert torch.equal(found, INNER["record_planes"].reference(*arguments))
 

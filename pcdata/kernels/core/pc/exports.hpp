@@ -162,11 +162,6 @@ PC_EXPORT int32_t pc_led_back(const pc_context* context, const double* matrices,
 PC_EXPORT int32_t pc_are_plain_motions(const pc_context* context, const double* matrices, int64_t count,
                                        int64_t* plain);
 
-// mask (sum of counts,): of each cloud's counts (clouds,) rows the wanted (clouds,) become 1 that its seed chooses, the
-// others 0.
-PC_EXPORT int32_t pc_random_rows(const pc_context* context, int64_t num_clouds, const int64_t* counts,
-                                 const int64_t* wanted, const int64_t* seeds, uint8_t* mask);
-
 // rows (sum of wanted,): the first wanted (clouds,) rows of a permutation of each cloud's counts (clouds,) rows, at
 // most 2^32 - 1, sorted by the upper halves of the words of its seed and then by themselves; rows are those of all
 // clouds.
@@ -364,11 +359,11 @@ PC_EXPORT int32_t pc_sample_depth(const pc_context* context, const float* depth,
 // -- neighbors --------------------------------------------------------------------------------------------------------
 
 // queries null: the points; pixel null: no grid; neighbors have d2 <= limit, or <= that of their query where limits
-// (Q,) is not null; count may be null.
+// (Q,) is not null.
 PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                                const float* queries, const int64_t* queries_ptr, int64_t k, double limit,
                                const float* limits, const int64_t* pixel, int64_t width, const double* camera,
-                               int64_t* index, float* distance, int64_t* count);
+                               int64_t* index, float* distance);
 
 // The same for points (N, width) and queries (Q, width), without a grid; rows are less than 2^32 - 1. norm: 0 straight
 // distances, 1 sums of the columns' differences, 2 the largest of them; of those, limit is of the distance itself.
@@ -471,48 +466,17 @@ PC_EXPORT int32_t pc_find_voxel_sizes(const pc_context* context, const float* po
 
 // -- planes -----------------------------------------------------------------------------------------------------------
 
-// points (N, 3), ptr (num_clouds+1,), triples (T, count, 3) of rows within a cloud, which (num_clouds,) of the T each
-// cloud takes -> planes (num_clouds, count, 4); NaN for triples on a line.
-PC_EXPORT int32_t pc_planes_of_triples(const pc_context* context, const float* points, const int64_t* ptr,
-                                       int64_t num_clouds, const int64_t* triples, int64_t count, const int64_t* which,
-                                       double flat, double* planes);
-
-// Runs of 64 points that follow each other in a cloud, for pc_record_planes. run_ptr (num_clouds+1,) has room for whole
-// groups of 16 runs per cloud -> runs (8, R): first point, last point, how far the others lie from the segment between
-// them, how many there are.
-PC_EXPORT int32_t pc_bound_runs(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
-                                const int64_t* run_ptr, float* runs);
-
-// points (N, 3), ptr (num_clouds+1,), what pc_bound_runs made or null, planes (num_clouds, H, 4), competes (num_clouds,
-// H) 0 or 1, floors (num_clouds,) -> counts (num_clouds, H): the points of each cloud with |((nx*x + ny*y) + nz*z) + d|
-// < distance, where the plane competes and has more of them than all before it that do, and than the floor; else 0.
-PC_EXPORT int32_t pc_record_planes(const pc_context* context, const float* points, const int64_t* ptr,
-                                   int64_t num_clouds, const int64_t* run_ptr, const float* runs, const float* planes,
-                                   const uint8_t* competes, int64_t num_planes, double distance, const int64_t* floors,
-                                   int64_t* counts);
-
-// points (N, 3), ptr (num_clouds+1,), planes (num_clouds, H, 4), competes (num_clouds, H) 0 or 1 -> counts (num_clouds,
-// H) as pc_record_planes gives them with floors of 0, on 2^bits points of each cloud that has more; 0 of all behind the
-// plane after which the search may stop: missed = log(1 - probability), and the first not_drawn are no tries.
-PC_EXPORT int32_t pc_search_planes(const pc_context* context, const float* points, const int64_t* ptr,
-                                   int64_t num_clouds, int64_t bits, const float* planes, const uint8_t* competes,
-                                   int64_t num_planes, double distance, double missed, int64_t not_drawn,
-                                   int64_t* counts);
-
-// points (N, 3), ptr (num_clouds+1,), what pc_bound_runs made or null, planes (num_clouds, 4) -> near (N,), 0 or 1:
-// whether a point is near its cloud's.
+// points (N, 3), ptr (num_clouds+1,), planes (num_clouds, 4) -> near (N,), 0 or 1: whether a point is near its cloud's.
 PC_EXPORT int32_t pc_near_planes(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
-                                 const int64_t* run_ptr, const float* runs, const float* planes, double distance,
-                                 uint8_t* near);
+                                 const float* planes, double distance, uint8_t* near);
 
-// points (N, 3), ptr (num_clouds+1,), what pc_bound_runs made or null; planes (num_clouds, 4) become the least-squares
-// planes of the points near them, again and again, at most `rounds` times, until those no longer change; the last that
-// lies on no line, has 3 points near it and is within max_tilt of its cloud's up (num_clouds, 3) or null, or of -up,
-// and the points near it -> near (N,). The same bits for any number of threads and any instruction set.
+// points (N, 3), ptr (num_clouds+1,); planes (num_clouds, 4) become the least-squares planes of the points near them,
+// again and again, at most `rounds` times, until those no longer change; the last that lies on no line, has 3 points
+// near it and is within max_tilt of its cloud's up (num_clouds, 3) or null, or of -up, and the points near it -> near
+// (N,). The same bits for any number of threads and any instruction set.
 PC_EXPORT int32_t pc_refine_planes(const pc_context* context, const float* points, const int64_t* ptr,
-                                   int64_t num_clouds, const int64_t* run_ptr, const float* runs, double distance,
-                                   const double* up, double max_tilt, double flat, int64_t rounds, double* planes,
-                                   uint8_t* near);
+                                   int64_t num_clouds, double distance, const double* up, double max_tilt, double flat,
+                                   int64_t rounds, double* planes, uint8_t* near);
 
 // points (N, 3), ptr (num_clouds+1,) of clouds of three points or more, words (T, 3, num_draws) of 32 bits, which
 // (num_clouds,) of the T each cloud takes, planes to try before those (num_clouds, 4) or null, unit vectors

@@ -41,7 +41,6 @@ constexpr int kLanes = kRegisterBytes / 4;
 typedef float FloatRegister __attribute__((vector_size(kRegisterBytes)));
 typedef double DoubleRegister __attribute__((vector_size(kRegisterBytes)));
 typedef int32_t Int32Register __attribute__((vector_size(kRegisterBytes)));
-typedef uint32_t Uint32Register __attribute__((vector_size(kRegisterBytes)));
 typedef int64_t Int64Register __attribute__((vector_size(kRegisterBytes)));
 
 template <class Register, class T>

@@ -10,22 +10,18 @@ struct WriteNeighbors {
   int64_t k, num_points;
   int64_t* index;   // (Q, k)
   float* distance;  // (Q, k)
-  int64_t* count;   // (Q,) or null
 
   template <class Search, class Nearest>
   void operator()(const Search& search, const QueryGroup& group, const Nearest& nearest, const uint32_t* row) const {
     for (PackMask left = group.active; left != 0; left &= left - 1) {
       const int lane = __builtin_ctz(left);
       const int64_t query = row[lane];
-      int64_t found = 0;
       for (int i = 0; i < k; ++i) {
         const uint64_t key = nearest.key(i, lane);
         const bool real = NearKey::id(key) != kNoId;
         index[query * k + i] = real ? search.row(NearKey::id(key)) : num_points;
         distance[query * k + i] = real ? std::sqrt(NearKey::squared(key)) : kInfinity;
-        found += real;
       }
-      if (count != nullptr) count[query] = found;
     }
   }
 };
@@ -73,13 +69,13 @@ void find_in_index(const pc_context& context, const Limits& limits, const Leaves
 PC_EXPORT int32_t pc_neighbors(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                                const float* queries, const int64_t* queries_ptr, int64_t k, double limit,
                                const float* limits, const int64_t* pixel, int64_t width, const double* camera,
-                               int64_t* index, float* distance, int64_t* count) {
+                               int64_t* index, float* distance) {
   using namespace pc;
   using namespace pc::neighbors;
   return guarded([&] {
     const Grid grid{pixel, width, camera};
     const Clouds clouds{points, ptr, num_clouds}, from{queries, queries_ptr, num_clouds};
-    const WriteNeighbors task{k, ptr[num_clouds], index, distance, count};
+    const WriteNeighbors task{k, ptr[num_clouds], index, distance};
     const auto find = k <= NearestKeys::kMax ? find_neighbors<NearestKeys> : find_neighbors<NearestMany>;
     find(*context, {static_cast<float>(limit), limits}, clouds, queries == nullptr ? nullptr : &from,
          pixel == nullptr ? nullptr : &grid, task);
@@ -117,7 +113,7 @@ PC_EXPORT int32_t pc_indexed_neighbors(const pc_context* context, const float* l
     // Searching reads leaves and boxes alone.
     const Leaves own{reinterpret_cast<Leaf*>(const_cast<float*>(leaves)), leaf_ptr, num_clouds};
     const Clouds from{queries, queries_ptr, num_clouds};
-    const WriteNeighbors task{k, num_points, index, distance, nullptr};
+    const WriteNeighbors task{k, num_points, index, distance};
     const auto find = k <= NearestKeys::kMax ? find_in_index<NearestKeys> : find_in_index<NearestMany>;
     find(*context, {static_cast<float>(limit), limits}, own, reinterpret_cast<Boxes*>(const_cast<float*>(boxes)),
          queries == nullptr ? nullptr : &from, task);

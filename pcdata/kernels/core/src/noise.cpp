@@ -162,19 +162,6 @@ PC_EXPORT int32_t pc_move_points(const pc_context* context, const float* points,
   });
 }
 
-PC_EXPORT int32_t pc_random_rows(const pc_context* context, int64_t num_clouds, const int64_t* counts,
-                                 const int64_t* wanted, const int64_t* seeds, uint8_t* mask) {
-  using namespace pc;
-  using namespace pc::noise;
-  (void)context;
-  return guarded([&] {
-    for (int64_t cloud = 0; cloud < num_clouds; ++cloud) {
-      choose_rows(counts[cloud], wanted[cloud], static_cast<uint64_t>(seeds[cloud]), mask);
-      mask += counts[cloud];
-    }
-  });
-}
-
 PC_EXPORT int32_t pc_dropped_rows(const pc_context* context, const int64_t* keys, const int64_t* ptr,
                                   int64_t num_clouds, double low, double high, uint8_t* mask, int64_t* kept_ptr) {
   using namespace pc;

@@ -19,14 +19,14 @@ struct SearchRules {
 class PlaneOfCloud {
  public:
   PlaneOfCloud(const pc_context& context, const float* points, int64_t count, const SearchRules& rules)
-      : context_(context), points_(points), count_(count), rules_(rules), num_runs_(runs_of(count)) {}
+      : context_(context), points_(points), count_(count), rules_(rules) {}
 
   // `found` (3): of the hypotheses how many are planes and how many of those compete, where the best has too few points
   // near it; and how many it has, of those that are looked at.
   void find(const Draws& draws, const double* guess, const double* up, const double* upper, double* plane,
             uint8_t* near, int64_t* found) const {
     ScratchFrame scratch;
-    const Runs runs = known_runs(scratch);
+    const Runs runs = bound_runs(context_, points_, count_, scratch);
     const Hypotheses tried(points_, count_, draws, guess, upper, rules_.refinement, scratch);
     const Best best = rules_.missed == 0 ? best_of_all(tried, runs, scratch) : best_until_sure(tried);
     found[0] = found[1] = 0;
@@ -46,31 +46,12 @@ class PlaneOfCloud {
   static constexpr int64_t kFewest = 3;  // points
   static constexpr int kAllBits = 62;
 
-  struct Best {
-    int64_t plane = 0, near = 0;
-  };
-
-  Runs known_runs(ScratchFrame& scratch) const {
-    auto* facts = scratch.take<float>(kFacts * num_runs_);
-    parallel_for(context_, num_runs_, 128, [&](int64_t begin, int64_t end, int64_t) {
-      for (int64_t run = begin; run < end; ++run) bound_run(points_, count_, run, facts + run, num_runs_);
-    });
-    return {facts, num_runs_, {0, num_runs_}, points_, {0, count_}};
-  }
-
   Best best_of_all(const Hypotheses& tried, const Runs& runs, ScratchFrame& scratch) const {
     parallel_for(context_, tried.count(), 256,
                  [&](int64_t begin, int64_t end, int64_t) { tried.make(begin, end - begin); });
-    auto* counts = scratch.take<int64_t>(tried.count());
-    // Runs of a small cloud tell too little to be worth a look.
-    const Runs told(runs.first_x, num_runs_, {0, count_ <= kSmallCloud ? 0 : num_runs_}, points_, {0, count_});
-    Records(context_, points_, {0, count_}, told, tried.rounded_planes(), tried.competes(), tried.count(),
-            static_cast<float>(rules_.distance), 0, counts)
-        .find();
-    Best best;
-    for (int64_t at = 0; at < tried.count(); ++at)
-      if (counts[at] > best.near) best = {at, counts[at]};
-    return best;
+    return Records(context_, runs, tried.rounded_planes(), tried.competes(), tried.count(),
+                   static_cast<float>(rules_.distance))
+        .best(scratch);
   }
 
   Best best_until_sure(const Hypotheses& tried) const {
@@ -108,7 +89,6 @@ class PlaneOfCloud {
   const float* points_;
   int64_t count_;
   const SearchRules& rules_;
-  int64_t num_runs_;
 };
 
 }  // namespace

@@ -26,10 +26,6 @@ PC_HD float mixed(float a, float b, float part) { return a + part * (b - a); }
 // scale / value, `none` where there is no reading.
 PC_HD float reciprocal(float value, float scale, float none) { return value > 0 ? scale / value : none; }
 
-// Stands for no reading where values are averaged along a line: far from every value, yet finite, for no step to it is
-// small, and what is multiplied by 0 leaves nothing.
-constexpr float kHoleOfLine = -1e30F;
-
 // An average along a line that starts anew at every edge.
 struct LineAverage {
   float raw, mean;

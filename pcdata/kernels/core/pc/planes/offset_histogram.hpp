@@ -205,7 +205,7 @@ class OffsetHistogram {
       for (int k = 0; k < kFacts; ++k) facts[k * room + next] = from[k][run];
       ++next;
     }
-    beyond_ = Runs(facts, room, {0, room}, runs.points, {0, runs.num_points});
+    beyond_ = Runs(facts, room, runs.points, runs.num_points);
   }
 
   float distance_;
@@ -218,7 +218,7 @@ class OffsetHistogram {
   float *down_ = nullptr, *right_ = nullptr;
   int32_t* cell_ = nullptr;
   int64_t num_cells_ = 0;
-  Runs beyond_{nullptr, 0, {0, 0}, nullptr, {0, 0}};
+  Runs beyond_{nullptr, 0, nullptr, 0};
 };
 
 }  // namespace pc::planes

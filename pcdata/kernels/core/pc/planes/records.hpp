@@ -1,4 +1,4 @@
-// Which of many planes have more points near them than all before.
+// Which of many planes has the most points near it.
 #pragma once
 
 #include <atomic>
@@ -12,49 +12,34 @@ namespace pc::planes {
 constexpr int64_t kCountedPiece = 8 * PointBlock::kSize;
 static_assert(kCountedPiece == kSmallCloud);
 
-// Counts of all planes on points [begin, end).
-inline void count_piece(const float* points, int64_t begin, int64_t end, const Plane* planes, int64_t num_planes,
-                        float distance, int64_t* counts) {
-  PointBlock block;
-  for (int64_t i = begin; i < end; i += PointBlock::kSize) {
-    block.read(points, i, std::min<int64_t>(end, i + PointBlock::kSize));
-    count_near_all(block, planes, num_planes, distance, counts);
-  }
-}
+// A plane by its number, and the points near it.
+struct Best {
+  int64_t plane = 0, near = 0;
+};
 
-// Finds the records among the planes of one cloud: those that have more points near them than all before.
+// Counts the points of a cloud near planes: of those that may have more of them than all before.
 class Records {
  public:
-  Records(const pc_context& context, const float* points, Range rows, const Runs& runs, const Plane* planes,
-          const uint8_t* competes, int64_t num_planes, float distance, int64_t floor, int64_t* counts)
+  Records(const pc_context& context, const Runs& runs, const Plane* planes, const uint8_t* competes, int64_t num_planes,
+          float distance)
       : context_(context),
-        points_(points),
-        rows_(rows),
         runs_(runs),
         planes_(planes),
         competes_(competes),
         num_planes_(num_planes),
-        distance_(distance),
-        floor_(floor),
-        counts_(counts) {}
+        distance_(distance) {}
 
-  void find() {
-    if (is_small(rows_)) {
-      std::fill_n(counts_, num_planes_, 0);
-      count_piece(points_, rows_.begin, rows_.end, planes_, num_planes_, distance_, counts_);
-    } else if (!find_by_histogram() && !find_by_runs()) {
-      count_all();
-    }
-    for (int64_t h = 0; h < num_planes_; ++h) {
-      if (competes_[h] && counts_[h] > floor_)
-        floor_ = counts_[h];
-      else
-        counts_[h] = 0;
-    }
+  // The plane with the most points near it, of those that compete; the first of equals.
+  Best best(ScratchFrame& scratch) {
+    counts_ = scratch.take<int64_t>(num_planes_);
+    // Runs of a small cloud tell too little to be worth a look.
+    const bool is_large = runs_.num_points > kSmallCloud;
+    if (!is_large || (!find_by_histogram() && !find_by_runs())) count_all();
+    Best best;
+    for (int64_t h = 0; h < num_planes_; ++h)
+      if (competes_[h] && counts_[h] > best.near) best = {h, counts_[h]};
+    return best;
   }
-
-  // Small clouds are searched side by side, each by one thread.
-  static bool is_small(Range rows) { return rows.size() <= kCountedPiece; }
 
  private:
   static constexpr int64_t kPlanes = 16;                              // that one thread takes at a time: some 100 us
@@ -63,7 +48,6 @@ class Records {
 
   // False where the runs say too little about the points to be worth it.
   bool find_by_runs() {
-    if (runs_.count == 0) return false;
     std::vector<CountBounds> bounds(static_cast<size_t>(num_planes_), {0, 0});
     parallel_for(context_, num_planes_, kPlanes, [&](int64_t begin, int64_t end, int64_t) {
       for (int64_t h = begin; h < end; ++h)
@@ -72,12 +56,12 @@ class Records {
     int64_t open = 0, total = 0;
     for (int64_t h = 0; h < num_planes_; ++h) {
       open += bounds[static_cast<size_t>(h)].most - bounds[static_cast<size_t>(h)].least;
-      total += competes_[h] ? rows_.size() : 0;
+      total += competes_[h] ? runs_.num_points : 0;
     }
     if (open > total / 2) return false;
     std::fill_n(counts_, num_planes_, 0);
     std::vector<Candidate> some;
-    int64_t least = floor_;
+    int64_t least = 0;
     for (int64_t h = 0; h < num_planes_; ++h) {
       const CountBounds& own = bounds[static_cast<size_t>(h)];
       if (own.most > least) some.push_back({h, least});
@@ -89,7 +73,7 @@ class Records {
 
   // The same where few of many planes can have as many points as the one that seems best.
   bool find_by_histogram() {
-    if (runs_.count == 0 || rows_.size() < kManyPoints || num_planes_ < kManyPlanes) return false;
+    if (runs_.num_points < kManyPoints || num_planes_ < kManyPlanes) return false;
     ScratchFrame scratch;
     const ScoredPoints sample(runs_.points, runs_.num_points, kSampleBits, scratch);
     std::vector<int64_t> score(static_cast<size_t>(num_planes_), 0);
@@ -102,7 +86,7 @@ class Records {
     for (int64_t h = 0; h < num_planes_; ++h)
       if (competes_[h] && score[static_cast<size_t>(h)] > best) {
         best = score[static_cast<size_t>(h)];
-        likely.push_back({h, floor_});
+        likely.push_back({h, 0});
       }
     if (likely.empty()) return false;
     const OffsetHistogram histogram(context_, runs_, planes_[likely.back().plane], distance_, sample, scratch);
@@ -118,7 +102,7 @@ class Records {
     std::fill_n(counts_, num_planes_, 0);
     count_candidates(likely);
     std::vector<Candidate> others;
-    int64_t least = floor_;
+    int64_t least = 0;
     for (int64_t h = 0; h < num_planes_; ++h) {
       if (counts_[h] == 0 && most[static_cast<size_t>(h)] > least) others.push_back({h, least});
       least = std::max(least, counts_[h]);
@@ -156,14 +140,18 @@ class Records {
 
   void count_all() {
     ScratchFrame scratch;
-    const int64_t num_pieces = (rows_.size() + kCountedPiece - 1) / kCountedPiece;
+    const int64_t num_pieces = (runs_.num_points + kCountedPiece - 1) / kCountedPiece;
     int64_t* own = scratch.take<int64_t>(num_pieces * num_planes_);  // (piece, plane)
     parallel_for(context_, num_pieces, 1, [&](int64_t begin, int64_t end, int64_t) {
+      PointBlock block;
       for (int64_t p = begin; p < end; ++p) {
-        const int64_t first = rows_.begin + p * kCountedPiece;
-        std::fill_n(own + p * num_planes_, num_planes_, 0);
-        count_piece(points_, first, std::min<int64_t>(rows_.end, first + kCountedPiece), planes_, num_planes_,
-                    distance_, own + p * num_planes_);
+        int64_t* counts = own + p * num_planes_;
+        std::fill_n(counts, num_planes_, 0);
+        const int64_t last = std::min(runs_.num_points, (p + 1) * kCountedPiece);
+        for (int64_t i = p * kCountedPiece; i < last; i += PointBlock::kSize) {
+          block.read(runs_.points, i, std::min<int64_t>(last, i + PointBlock::kSize));
+          count_near_all(block, planes_, num_planes_, distance_, counts);
+        }
       }
     });
     std::fill_n(counts_, num_planes_, 0);
@@ -172,15 +160,12 @@ class Records {
   }
 
   const pc_context& context_;
-  const float* points_;
-  Range rows_;
-  Runs runs_;
+  const Runs& runs_;
   const Plane* planes_;
   const uint8_t* competes_;
   int64_t num_planes_;
   float distance_;
-  int64_t floor_;
-  int64_t* counts_;
+  int64_t* counts_ = nullptr;
 };
 
 }  // namespace pc::planes

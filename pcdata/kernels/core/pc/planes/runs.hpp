@@ -10,13 +10,14 @@
 #include <cmath>
 #include <limits>
 
+#include "pc/memory.hpp"
 #include "pc/planes/plane_sums.hpp"
 #include "pc/threads.hpp"
 
 namespace pc::planes {
 
 constexpr int kRun = 64;             // points
-constexpr int64_t kRunsAtOnce = 16;  // clouds begin at multiples of so many runs, whatever a register holds
+constexpr int64_t kRunsAtOnce = 16;  // clouds have multiples of so many runs, whatever a register holds
 
 // Float operations of a distance are off by less than this part of the largest number that enters.
 constexpr float kRounding = 1e-6F;
@@ -35,10 +36,11 @@ struct Runs {
   const float* points;  // of the cloud
   int64_t num_points;
 
-  Runs(const float* runs, int64_t num_runs, Range own, const float* all_points, Range rows)
-      : count(own.size()), points(all_points + 3 * rows.begin), num_points(rows.size()) {
+  // The numbers are `num_runs` apart.
+  Runs(const float* numbers, int64_t num_runs, const float* own_points, int64_t count_of_points)
+      : count(num_runs), points(own_points), num_points(count_of_points) {
     const float** const facts[kFacts] = {&first_x, &first_y, &first_z, &last_x, &last_y, &last_z, &reach, &size};
-    for (int k = 0; k < kFacts; ++k) *facts[k] = runs + k * num_runs + own.begin;
+    for (int k = 0; k < kFacts; ++k) *facts[k] = numbers + k * num_runs;
   }
 };
 
@@ -102,6 +104,16 @@ inline void bound_run(const float* points, int64_t num_points, int64_t run, floa
   for (int axis = 0; axis < 3; ++axis) facts[axis * stride] = first[axis], facts[(3 + axis) * stride] = last[axis];
   facts[6 * stride] = reach;
   facts[7 * stride] = static_cast<float>(own.size());
+}
+
+// Find out about all runs of a cloud; memory is the scratch's, until its frame ends.
+inline Runs bound_runs(const pc_context& context, const float* points, int64_t count, ScratchFrame& scratch) {
+  const int64_t num_runs = runs_of(count);
+  auto* facts = scratch.take<float>(kFacts * num_runs);
+  parallel_for(context, num_runs, 128, [&](int64_t begin, int64_t end, int64_t) {
+    for (int64_t run = begin; run < end; ++run) bound_run(points, count, run, facts + run, num_runs);
+  });
+  return {facts, num_runs, points, count};
 }
 
 // What is known of a register of runs: all points are near the plane, none is, or neither is certain.
