@@ -12,130 +12,11 @@
 #include "pc/bounds.hpp"
 #include "pc/cells/block_bitmap.hpp"
 #include "pc/cells/cell_counts.hpp"
+#include "pc/cells/marked_sequence.hpp"
 #include "pc/cells/neighborhood.hpp"
 
 namespace pc::cells {
 namespace {
-
-struct RadiusSearch {
-  const float* points;  // (count, 3) one cloud
-  int64_t count;
-  float radius, limit;    // a neighbor has d2 < limit
-  int64_t enough;         // neighbors that make an inlier, itself included
-  uint8_t* outlier;       // (count,) 1 = not yet shown to be an inlier
-  const int64_t* pixel;   // (count,) where each point lies in an image, rising; null = unknown
-  int64_t width;          // of the image
-  const uint8_t* within;  // (count,) the points that there are; null = all
-
-  bool has(int64_t i) const { return within == nullptr || within[i] != 0; }
-};
-
-// Coordinates of the points around a piece of a cloud, infinitely far away (so never near) outside the cloud.
-constexpr int kPiece = 1024;
-constexpr int kMostAround = 128;
-struct Window {
-  static constexpr int kSize = kPiece + 2 * kMostAround;
-  alignas(64) float x[kSize], y[kSize], z[kSize];
-
-  void load(const RadiusSearch& search, int64_t first) {  // slot 0 is point `first`, which may be negative
-    const int64_t count = search.count;
-    const int begin = static_cast<int>(std::clamp<int64_t>(-first, 0, kSize));
-    const int end = static_cast<int>(std::clamp<int64_t>(count - first, 0, kSize));
-    const auto clear = [&](int from, int to) {
-      for (float* axis : {x, y, z}) std::fill(axis + from, axis + to, std::numeric_limits<float>::infinity());
-    };
-    clear(0, begin);
-    clear(end, kSize);
-    for (int i = begin; i < end; ++i) {
-      const float* point = search.points + 3 * (first + i);
-      x[i] = point[0];
-      y[i] = point[1];
-      z[i] = point[2];
-    }
-    if (search.within == nullptr) return;
-    for (int i = begin; i < end; ++i) x[i] = search.within[first + i] ? x[i] : std::numeric_limits<float>::infinity();
-  }
-  bool near(int a, int b, float limit) const {
-    return math::squared_distance(x[a], y[a], z[a], x[b], y[b], z[b]) < limit;
-  }
-};
-
-// Finds the pixel so many rows away from one point after another. It looks first as many points away as it was for the
-// last one: rows of an image lose about equally many pixels.
-class PixelSearch {
- public:
-  explicit PixelSearch(const RadiusSearch& search) : search_(search) {}
-
-  // The first point at or after a pixel, which is some rows away from point i.
-  int64_t seek(int64_t pixel, int64_t i) {
-    const int64_t* begin = search_.pixel;
-    const int64_t* end = begin + search_.count;
-    const int64_t* low = begin + std::clamp<int64_t>(i + away_, 0, search_.count - 1);
-    const int64_t* high = low;
-    for (int64_t step = 1; low > begin && *low >= pixel; step *= 2) low -= std::min<int64_t>(step, low - begin);
-    for (int64_t step = 1; high < end && *high < pixel; step *= 2) high += std::min<int64_t>(step, end - high);
-    const int64_t found = std::lower_bound(low, high, pixel) - begin;
-    away_ = found - i;
-    return found;
-  }
-
- private:
-  const RadiusSearch& search_;
-  int64_t away_ = 0;
-};
-
-// Whether point i has enough neighbors in the image rows around its own, near rows first. `seekers` has one search for
-// each row. Looks at kColumnsAround pixels to both sides; in a narrower image the looks would overlap, and count points
-// twice and point i itself.
-constexpr int kRowsAround = 8;
-constexpr int64_t kColumnsAround = 4, kNarrowest = 2 * kColumnsAround + 1;
-bool enough_in_rows(const RadiusSearch& search, PixelSearch* seekers, int64_t i) {
-  const float* q = search.points + 3 * i;
-  int64_t found = 1;
-  for (int r = 0; r < 2 * kRowsAround; ++r) {
-    const int64_t rows_away = (r % 2 ? 1 : -1) * (r / 2 + 1);
-    const int64_t first = search.pixel[i] + rows_away * search.width - kColumnsAround;
-    for (int64_t other = seekers[r].seek(first, i);
-         other < search.count && search.pixel[other] <= first + 2 * kColumnsAround; ++other) {
-      const float* p = search.points + 3 * other;
-      found += math::squared_distance(p[0], p[1], p[2], q[0], q[1], q[2]) < search.limit && search.has(other);
-    }
-    if (found >= search.enough) return true;
-  }
-  return false;
-}
-
-// Clear the mark of points with enough neighbors among the `close` points before and after them, then among `wide`,
-// then in the image rows around them. Returns how many points of [begin, end) stay marked.
-int64_t search_sequence(const RadiusSearch& search, int64_t begin, int64_t end, int close, int wide) {
-  Window window;
-  window.load(search, begin - kMostAround);
-  const int count = static_cast<int>(end - begin);
-  const float limit = search.limit;
-  uint8_t* outlier = search.outlier + begin;
-  int32_t near[kPiece];
-  std::fill(near, near + count, 1);
-  for (int step = 1; step <= close; ++step)
-    for (int i = 0; i < count; ++i) {
-      const int slot = i + kMostAround;
-      near[i] += window.near(slot, slot - step, limit) + window.near(slot, slot + step, limit);
-    }
-  int64_t left = 0;
-  for (int i = 0; i < count; ++i) left += outlier[i] = near[i] < search.enough && search.has(begin + i);
-  // A piece whose points have few neighbors so close by in memory is in no order, and a wider look would be wasted.
-  if (2 * left > count) return left;
-  const bool has_rows = search.pixel != nullptr && search.width >= kNarrowest;
-  std::vector<PixelSearch> seekers(has_rows ? 2 * kRowsAround : 0, PixelSearch(search));
-  for (int i = 0; i < count; ++i) {
-    if (!outlier[i]) continue;
-    const int slot = i + kMostAround;
-    int32_t found = 0;  // counts the point itself
-    for (int other = slot - wide; other <= slot + wide; ++other) found += window.near(slot, other, limit);
-    outlier[i] = found < search.enough && !(has_rows && enough_in_rows(search, seekers.data(), begin + i));
-    left -= !outlier[i];
-  }
-  return left;
-}
 
 // Clear the mark of every marked point with enough neighbors; `rows` picks the points that count, null = all.
 template <class Key>
@@ -168,8 +49,8 @@ Pick pick_around_marked(const pc_context& context, ScratchFrame& scratch, const 
   std::vector<Range> pieces = even_pieces(context, search.count);
   const auto num_pieces = static_cast<int64_t>(pieces.size());
   parallel_for(context, num_pieces, 1, [&](int64_t p, int64_t, int64_t) {
-    for (int64_t i = pieces[p].begin; i < pieces[p].end; ++i)
-      if (search.outlier[i]) blocks.mark_around(search.points + 3 * i);
+    for_each_marked(search.outlier, pieces[p].begin, pieces[p].end,
+                    [&](int64_t i) { blocks.mark_around(search.points + 3 * i); });
   });
   uint32_t* rows = scratch.take<uint32_t>(search.count);
   parallel_for(context, num_pieces, 1, [&](int64_t p, int64_t, int64_t) {
@@ -206,8 +87,9 @@ Pick pick_all(ScratchFrame& scratch, const RadiusSearch& search) {
   return {rows, count};
 }
 
-// Mark what has few neighbors before and after it in memory; returns how many points those are.
-int64_t mark_by_sequence(const pc_context& context, const RadiusSearch& search) {
+// Mark what has few neighbors before and after it in memory; returns how many points those are. The box around all
+// points is found in the same pass.
+int64_t mark_by_sequence(const pc_context& context, const RadiusSearch& search, math::Bounds& box) {
   // Twice as many points as are needed; beyond this, cells are quicker.
   constexpr int64_t kMostClose = 16;
   const int64_t close = search.enough / 2 + 1;
@@ -225,19 +107,28 @@ int64_t mark_by_sequence(const pc_context& context, const RadiusSearch& search) 
     }
   }
   if (!in_order) {
+    box = parallel_bounds(context, search.points, search.count);
+    std::fill(search.outlier, search.outlier + search.count, uint8_t{1});
+    if (search.within == nullptr) return search.count;
     int64_t all = 0;
     for (int64_t i = 0; i < search.count; ++i) all += search.outlier[i] = search.has(i);
     return all;
   }
   std::atomic<int64_t> marked{0};
-  parallel_for(context, search.count, kPiece, [&](int64_t begin, int64_t end, int64_t) { marked += mark(begin, end); });
+  std::vector<math::Bounds> boxes(static_cast<size_t>((search.count + kPiece - 1) / kPiece));
+  parallel_for(context, search.count, kPiece, [&](int64_t begin, int64_t end, int64_t) {
+    marked += mark(begin, end);
+    boxes[static_cast<size_t>(begin / kPiece)] = bounds_of(search.points, begin, end);
+  });
+  box = hull(boxes);
   return marked;
 }
 
 // Decide one cloud; returns its largest cell coordinate, and decides nothing when that is too large.
 double search_cloud(const pc_context& context, const RadiusSearch& search) {
   ScratchFrame scratch;
-  math::Bounds box = parallel_bounds(context, search.points, search.count);
+  math::Bounds box;
+  int64_t marked = mark_by_sequence(context, search, box);
   const double side = cell_side(search.radius);
   double largest = largest_coordinate(box, side);
   if (largest >= kMostCellsPerAxis && search.within != nullptr) {  // what is far out may be no point
@@ -248,8 +139,6 @@ double search_cloud(const pc_context& context, const RadiusSearch& search) {
     largest = largest_coordinate(box, side);
   }
   if (largest >= kMostCellsPerAxis) return largest;
-
-  int64_t marked = mark_by_sequence(context, search);
   if (marked == 0) return largest;
 
   constexpr int64_t kFew = 8;     // picking pays while fewer than one point in this many is marked
