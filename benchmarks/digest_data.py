@@ -157,7 +157,6 @@ NAMES = ("a", "b", "c")
 SPLITS = {
     name: {"class": "mug" if name < "c" else "bowl", "split": "train" if name < "c" else "test"} for name in NAMES
 }
-GRASPS = {name: {"positive": [[[5.0, 6.0], [9.0, 6.0], [9.0, 10.0], [5.0, 10.0]]]} for name in NAMES}
 
 
 def _shapes(count: int) -> Samples:

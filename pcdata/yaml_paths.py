@@ -17,13 +17,13 @@ from pcdata.yaml_nodes import GivenMark, YamlDocument, compose
 _NULL, _MAP, _TEXT = "tag:yaml.org,2002:null", "tag:yaml.org,2002:map", "tag:yaml.org,2002:str"
 
 
-def set_value(document: YamlDocument, path: str, text: str, *, flag: str = "--set") -> None:
+def set_value(document: YamlDocument, path: str, text: str) -> None:
     """Set one value of a document that is not read yet.
 
     Raises:
         ConfigError: there is no such place, or the text is no YAML.
     """
-    where = f"{flag} {path}"
+    where = f"--set {path}"
     parts = path.split(".")
     if len(parts) < 2 or not all(parts):
         raise ConfigError(f"{where}={text}: needs a path such as output.format or cloud.CropWorkspace.bounds")

@@ -41,7 +41,6 @@ class PairFit:
     num_visible: int  # of them, that the target could see
     knows_visibility: bool  # of the target; False: every sample counts as visible
     system: PlaneSystem  # 6x6, of moving the source, whitened
-    unexplained: float  # metres, spread of the residuals beyond the sensors' noise: waves and bias in their depth
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,9 +195,7 @@ def _measure(
     weights = robust_weights(residual, cut, "tukey") / (sigma.square() + unexplained.square())
     system = plane_system(points, normals, residual, weights, pivot=pivot, normal_sigma=tilt)
     knows_visibility = all(capture[target].knows_visibility for capture in captures)
-    return PairFit(
-        source, target, row, residual, points, num_samples, num_visible, knows_visibility, system, float(unexplained)
-    )
+    return PairFit(source, target, row, residual, points, num_samples, num_visible, knows_visibility, system)
 
 
 def _solve(fits: Sequence[PairFit], num_views: int, fixed: int) -> TwistSolution:

@@ -36,11 +36,6 @@ class Schedule:
         self._given_up: dict[int, dict[str, str]] = {}
         self._deaths: dict[int, int] = {}
 
-    @property
-    def is_done(self) -> bool:
-        """Whether nothing is left but what runs."""
-        return not self._waiting and not self._alone
-
     def next(self, num_running: int) -> Task | None:
         """Return the next task, or None where one that runs must end first."""
         if self._waiting:

@@ -55,11 +55,6 @@ def differing(a: Tensor, b: Tensor) -> Tensor:
     return torch.from_numpy(a.numpy() != b.numpy()) if a.device.type == "cpu" else a != b
 
 
-def equal_values(a: Tensor, b: Tensor) -> bool:
-    """Say whether two tensors of one shape hold the same values."""
-    return bool(np.array_equal(a.numpy(), b.numpy())) if a.device.type == "cpu" else torch.equal(a, b)
-
-
 def rising(values: Tensor, ptr: Tensor) -> bool:
     """Say whether the (N,) values of every segment rise strictly."""
     starts = on_host(ptr)[1:-1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -179,13 +179,11 @@ class _Run:
         if bad := dict(self._bad_from(0)):
             self._plan(bad)
 
-    def _bad_from(self, start: int, bad: Collection[str] = ()) -> Iterator[tuple[str, str]]:
+    def _bad_from(self, start: int) -> Iterator[tuple[str, str]]:
         """Yield the samples of the items from one on that do not fit, with the reason."""
         for item in self.items[start:]:
             seen: dict[str, Any] = {}
             for sample_id in item.ids:
-                if sample_id in bad:
-                    continue
                 try:
                     self.target.examine(item, sample_id, self._load(sample_id), seen)
                 except UNFIT as error:

@@ -50,7 +50,6 @@ class _Step(NamedTuple):
     """What is written of one timestep."""
 
     frame: DepthFrame
-    camera_from_base: Tensor  # (4, 4)
     tcp: NDArray[np.float64]  # (7,) x y z, quaternion w x y z
     gripper: NDArray[np.float64]  # (1,) command
 
@@ -148,7 +147,7 @@ class _Rise(Target):
                 f"{where}: the camera moved, or has other intrinsics, within episode {item.episodes[0].id!r}, and RISE "
                 "has one calibration for all of it; choose the view of a camera that stands still: view=N"
             )
-        return _Step(frame, camera_from_base, tcp, width.astype(np.float64) / _OPEN * 1000)
+        return _Step(frame, tcp, width.astype(np.float64) / _OPEN * 1000)
 
     def _tcp(self, where: str, frame: DepthFrame) -> tuple[NDArray[np.float64], Tensor]:
         signals = frame.recorded_signals

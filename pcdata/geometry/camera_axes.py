@@ -21,13 +21,10 @@ def _axes(*columns: tuple[int, int, int]) -> Tensor:
 # A pose times its row is the pose of a camera with OpenCV's axes: x right, y down, z forward.
 CAMERA_AXES: dict[str, Tensor] = {
     "opencv": _axes((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    # x right, y up, z backwards: Blender, MuJoCo, Isaac Sim (USD) as well
     "opengl": _axes((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    # x left, y up, z forward; it states focal lengths below 0
     "coppeliasim": _axes((-1, 0, 0), (0, -1, 0), (0, 0, 1)),
+    # x forward, y left, z up: camera poses of SAPIEN, Isaac Sim (world axes), frames of ROS that are not optical
     "body": _axes((0, -1, 0), (0, 0, -1), (1, 0, 0)),
-}
-AXES_IN_WORDS = {
-    "opencv": "x right, y down, z forward",
-    "opengl": "x right, y up, z backwards: OpenGL, Blender, MuJoCo, Isaac Sim (USD)",
-    "coppeliasim": "x left, y up, z forward: CoppeliaSim, which states focal lengths below 0",
-    "body": "x forward, y left, z up: SAPIEN's camera poses, Isaac Sim (world axes), ROS frames that are not optical",
 }

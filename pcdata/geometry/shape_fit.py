@@ -25,14 +25,12 @@ class Family:
     """All shapes of one kind."""
 
     name: str
-    sample: int  # points that determine one
-    oriented: bool  # and their normals
+    sample: int  # points, with their normals or without, that determine one
     through: Callable[[Tensor, Tensor | None], Tensor]  # of points and normals (..., sample, 3): (..., K)
     distance: Callable[[Tensor, Tensor], Tensor]  # of points (..., 3) from shapes (..., K): (...)
     linear: Callable[[Tensor, Tensor], list[Linear]]  # of points (M, 3) about their own shapes (M, K)
     moved: Callable[[Tensor, Tensor], Tensor]  # shapes (B, K) by steps (B, D)
     has_radius: bool = True
-    has_direction: bool = True
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
@@ -210,12 +208,8 @@ def _circle_moved(shape: Tensor, step: Tensor) -> Tensor:
     return torch.cat([shape[:, :3] + shift, normal / length(normal)[:, None], shape[:, 6:] + step[:, 5:]], 1)
 
 
-SPHERE = Family(
-    "sphere", 4, False, _sphere_through, _sphere_distance, _sphere_linear, torch.add, has_direction=False
-)  # fmt: skip
-ORIENTED_SPHERE = Family(
-    "sphere", 2, True, _sphere_through, _sphere_distance, _sphere_linear, torch.add, has_direction=False
-)  # fmt: skip
-LINE = Family("line", 2, False, _line_through, _line_distance, _line_linear, _line_moved, has_radius=False)
-CYLINDER = Family("cylinder", 2, True, _cylinder_through, _cylinder_distance, _cylinder_linear, _cylinder_moved)
-CIRCLE = Family("circle", 3, False, _circle_through, _circle_distance, _circle_linear, _circle_moved)
+SPHERE = Family("sphere", 4, _sphere_through, _sphere_distance, _sphere_linear, torch.add)
+ORIENTED_SPHERE = Family("sphere", 2, _sphere_through, _sphere_distance, _sphere_linear, torch.add)
+LINE = Family("line", 2, _line_through, _line_distance, _line_linear, _line_moved, has_radius=False)
+CYLINDER = Family("cylinder", 2, _cylinder_through, _cylinder_distance, _cylinder_linear, _cylinder_moved)
+CIRCLE = Family("circle", 3, _circle_through, _circle_distance, _circle_linear, _circle_moved)

@@ -11,7 +11,6 @@ from pcdata.sensors.noise import Depth, PolynomialNoise, StereoNoise
 
 Kind = Literal["stereo", "structured_light", "tof", "lidar"]
 
-FIGURES = ("size", "field_of_view", "focal", "angular_step", "metres_per_unit", "range", "noise", "depth_step")
 _SIGMAS = 3.0  # of a normal error, 99.7 % lie within
 _STEEPEST = math.tan(math.radians(80.0))  # slope of the most slanted surface that still gives readings
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -151,16 +151,6 @@ def joined_episodes(parts: Iterable[tuple[str, int, Sequence[Episode]]]) -> list
             )
         before += num_samples
     return found
-
-
-def num_outside(episodes: Iterable[Episode], num_samples: int) -> int:
-    """Return how many samples belong to no episode."""
-    return num_samples - sum(episode.length for episode in episodes)
-
-
-def episodes_as_json(episodes: Iterable[Episode]) -> list[dict[str, Any]]:
-    """Return episodes as :func:`episodes_from_json` reads them."""
-    return [{**asdict(episode), "times": list(episode.times)} for episode in episodes]
 
 
 def episodes_from_json(where: str, entries: Any, num_samples: int, *, error: type[PcdataError]) -> list[Episode]:

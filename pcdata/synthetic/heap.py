@@ -38,7 +38,7 @@ def heap_objects(seed: int, num_objects: int) -> tuple[Shape, ...]:
         surface = _surface(shape)
         start = None
         if label % _STACKED == 0:
-            start = _on_top(placed, shape, surface, rise)
+            start = _on_top(placed, surface, rise)
         if start is None:
             start = _beside(placed, samples, shape, surface, rise, generator)
         pose = shape.base_from_object.clone()
@@ -125,7 +125,7 @@ def _distance(placed: list[Shape], samples: list[Tensor], shape: Shape, surface:
     return least
 
 
-def _on_top(placed: list[Shape], shape: Shape, surface: Tensor, rise: float) -> Tensor | None:
+def _on_top(placed: list[Shape], surface: Tensor, rise: float) -> Tensor | None:
     """Return where a shape stands on the first box that is wide enough and bears nothing; None where none is."""
     for box in placed:
         if not isinstance(box, Box):

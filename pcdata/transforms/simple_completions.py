@@ -68,7 +68,7 @@ def _membrane(depth: NDArray[np.float64], todo: NDArray[np.bool_]) -> NDArray[np
     number[solve] = np.arange(total)
     degree, right = np.zeros(total), np.zeros(total)
     links: list[tuple[NDArray[np.int64], NDArray[np.int64]]] = []
-    for here, there in _neighbor_views(depth.shape):
+    for here, there in _neighbor_views():
         mine, other, theirs = number[here], number[there], known[there]
         to_known = (mine >= 0) & theirs
         to_unknown = (mine >= 0) & (other >= 0)
@@ -81,7 +81,7 @@ def _membrane(depth: NDArray[np.float64], todo: NDArray[np.bool_]) -> NDArray[np
     return result
 
 
-def _neighbor_views(shape: tuple[int, ...]) -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
+def _neighbor_views() -> list[tuple[tuple[slice, slice], tuple[slice, slice]]]:
     """Pair every pixel with each of its 4-neighbors, as two views of an image."""
     every, front, back = slice(None), slice(None, -1), slice(1, None)
     right, down = ((every, front), (every, back)), ((front, every), (back, every))

@@ -66,7 +66,7 @@ class JoinedTopics:
         self._where = self.where = where
         self.file = log.files[0].path
         self._joining, self._color_from_depth = joining, choice.color_from_depth
-        self.said = _statement(where, log, choice)
+        self.said = _statement(where, log)
         images = image_topics(log)
         self.cameras = chosen_cameras(where, log, images, self.said, choice)
         self.frame_id = joining.frame_id if joining.frame_id is not None else self.said.frame_id
@@ -356,7 +356,7 @@ def _stream(role: str, topic: Topic, rule: str, counts: Mapping[str, int], large
     }
 
 
-def _statement(where: str, log: MessageLog, choice: Choice) -> Statement:
+def _statement(where: str, log: MessageLog) -> Statement:
     topic = log.topics.get(TOPIC)
     if topic is None or topic.type != "std_msgs/msg/String" or not len(topic):
         return Statement()

@@ -27,7 +27,6 @@ from pcdata.io.sources.listing import entries, has_file, is_folder
 _META, _RAW_FOLDER = "depth_meta.json", "depth"
 _CONFIGS = ("depth_config.json", "depth/depth_config.json", "meta/depth_config.json")
 _CHUNK, _EPISODE, _RAW = re.compile(r"chunk-\d+"), re.compile(r"episode_(\d+)\.mkv"), re.compile(r"episode_(\d+)\.bin")
-SIDECARS = (_META, *_CONFIGS)
 
 
 def depth_beside(where: str, root: Path, inside: Sequence[Path], index: LeRobotIndex) -> list[DepthStream]:

@@ -17,13 +17,12 @@ from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit, ways
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, UnitError
-from pcdata.files.opening import check_inside
 from pcdata.files.sample_names import check_known, name_some, positions
 from pcdata.functional.depth.unit_fit import WORTH_NAMING, likely_fits, unit_fits, units_in_words
 from pcdata.io.images.reading import read_color, read_raw_depth
 from pcdata.io.sources.frame_files import make_frame
 from pcdata.io.sources.joined_views import join_views
-from pcdata.io.sources.listing import LinkTargets, absolute, is_folder, link_targets, unread_entries, visible_files
+from pcdata.io.sources.listing import LinkTargets, absolute, is_folder, unread_entries, visible_files
 from pcdata.io.sources.option_checks import check_name, check_pinhole
 from pcdata.io.sources.source import Source
 from pcdata.structures import Camera, DepthFrame, Signal, register_to_color
@@ -259,12 +258,6 @@ def checked_folder(kind: str, path: Path, needs: str, *parts: str) -> Path:
     if missing := [part for part in parts if not os.path.lexists(path / part)]:
         raise CaptureError(f"{kind} source {path}: has no {name_some(missing)}; this layout needs {needs}")
     return path
-
-
-def allowed_links(where: str, path: Path, files: Iterable[Path], links_to: LinkTargets) -> None:
-    """Require that files which are read to open a capture lie in it, or in a folder of ``links_to``."""
-    for file in files:
-        check_inside(where, file, [path, *link_targets(links_to)])
 
 
 def one_of(where: str, option: str, name: str | None, names: Sequence[str]) -> str:

@@ -97,7 +97,7 @@ def _figures(gathered: Gathered) -> Iterator[tuple[str, Any]]:
         yield "episodes", episodes
     digits = max(2, len(str(len(gathered.looked))))
     for place, one in enumerate(gathered.looked, 1):
-        yield f"sample_{place:0{digits}}", _sample(gathered, one)
+        yield f"sample_{place:0{digits}}", _sample(one)
     rest = {"gaps": gaps_figure, "planes": planes_figure, "objects": objects_figure, "numbers": numbers_figure}
     for name, draw in rest.items():
         if (figure := draw(gathered)) is not None:
@@ -151,7 +151,7 @@ def _verdict_panel(axis: Any, grading: Grading, reasons: Sequence[str], size: tu
         text.set_in_layout(False)  # long words would leave the panels beside it no room
 
 
-def _sample(gathered: Gathered, one: Looked) -> Any:
+def _sample(one: Looked) -> Any:
     panels: list[Panel] = [partial(picture_panel, caption=picture.caption, png=picture.png) for picture in one.pictures]
     stages = one.scene.stages if one.scene is not None else ()
     clouds: list[Panel] = [partial(cloud_panel, stage=stage) for stage in stages]

@@ -22,6 +22,11 @@ from pcdata.verdicts import Finding, Verdict
 
 NAME = "color_registration"
 
+_MEND = (
+    "register depth to color with the factory's extrinsics, at this resolution; check that both images are of "
+    f"one moment (shifts beyond {SHIFT_LIMIT} pixels are not found)"
+)
+
 
 @dataclass
 class _Votes:
@@ -78,7 +83,7 @@ def _judged(votes: Tensor, num_edges: int, limits: CaptureLimits, view: int) -> 
     """
     offset = offset_from_votes(votes, num_edges)
     if offset.problem is None and offset.least_length > limits.color_shift:
-        verdict, advice = Verdict.FAIL, _mend(offset)
+        verdict, advice = Verdict.FAIL, _MEND
     elif offset.problem is None and offset.length <= limits.color_shift and offset.greatest_length < TELLABLE:
         verdict, advice = Verdict.PASS, ""
     else:
@@ -107,10 +112,3 @@ def _in_words(offset: EdgeOffset) -> str:
 
 def _reason(offset: EdgeOffset) -> str:
     return _in_words(offset) if offset.problem is None else offset.problem
-
-
-def _mend(offset: EdgeOffset) -> str:
-    return (
-        "register depth to color with the factory's extrinsics, at this resolution; check that both images are of "
-        f"one moment (shifts beyond {SHIFT_LIMIT} pixels are not found)"
-    )

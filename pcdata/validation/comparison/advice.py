@@ -31,7 +31,7 @@ _FACTS = {
 }
 
 
-def family_advice(family: str, rows: Sequence[Measured], sides: tuple[Side, Side]) -> str:
+def family_advice(family: str, rows: Sequence[Measured]) -> str:
     """Return what to do where no step closed a family."""
     if family != "colors":
         return _ADVICE.get(family, "look at both sources")

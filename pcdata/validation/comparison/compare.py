@@ -184,7 +184,7 @@ class _Comparing:
             families.setdefault(last[key].family, []).append(last[key])
         partly = {before[key].family: change for change, before, closed, _ in self.tried for key in closed}
         for family, rows in families.items():
-            advice = family_advice(family, rows, self.sides)
+            advice = family_advice(family, rows)
             if family in partly:
                 advice = f"{advice}; of what is left after {partly[family].name} was closed"
             yield Difference(name=family, verdict=worst(one.verdict for one in rows), found=_words(rows), advice=advice)

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 _FIRST, _STEPS, _COUNT = 0.125, 2, 18  # metres; classes for every doubling; up to 64 m
 NUM_CLASSES = _COUNT
 _FARTHEST = 2.0**100  # metres, of which the square is a float still
-FACING = -1  # of what has no distance
 
 
 def class_of(distance: NDArray[np.floating]) -> NDArray[np.int64]:

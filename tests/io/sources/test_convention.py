@@ -13,7 +13,7 @@ import torch
 from pcdata import DepthFrame, open_source
 from pcdata.errors import CaptureError, ConfigError, DTypeError
 from pcdata.functional.depth.rendered import ray_lengths, rendered_of_z, z_of_rendered
-from pcdata.geometry.camera_axes import AXES_IN_WORDS, CAMERA_AXES
+from pcdata.geometry.camera_axes import CAMERA_AXES
 from pcdata.geometry.rigid import invert_rigid
 from pcdata.synthetic import SyntheticSource
 from tests.captures import cloud_files
@@ -56,6 +56,14 @@ def test_a_pose_of_any_axes_is_that_of_a_camera_here(axes: str, tmp_path: Path) 
     assert torch.equal(found.depth, frame.depth)
 
 
+AXES_IN_WORDS = {
+    "opencv": "x right, y down, z forward",
+    "opengl": "x right, y up, z backwards",
+    "coppeliasim": "x left, y up, z forward",
+    "body": "x forward, y left, z up",
+}
+
+
 def test_axes_are_turns_that_lead_to_what_their_words_say() -> None:
     assert CAMERA_AXES.keys() == AXES_IN_WORDS.keys()
     for name, words in AXES_IN_WORDS.items():
@@ -63,7 +71,7 @@ def test_axes_are_turns_that_lead_to_what_their_words_say() -> None:
         assert torch.linalg.det(matrix) == pytest.approx(1.0)
         seen = dict(zip(("right", "down", "forward"), matrix.T))  # in the axes of the other
         seen |= {"left": -seen["right"], "up": -seen["down"], "backwards": -seen["forward"]}
-        for axis, told in enumerate(words.partition(":")[0].split(", ")):
+        for axis, told in enumerate(words.split(", ")):
             letter, direction = told.split()
             assert letter == "xyz"[axis]
             assert seen[direction].tolist() == np.eye(3)[axis].tolist()
