@@ -287,7 +287,7 @@ def _register() -> None:
     assert SET_UP is not None, "this PyTorch has no devices written in Python"
     SET_UP(NAME)
     module = torch.get_device_module(NAME)  # has no state of random numbers, which torch.random.fork_rng asks for
-    module.get_rng_state, module.set_rng_state = (lambda device: None), (lambda state, device: None)
+    module.get_rng_state, module.set_rng_state = (lambda device=None: None), (lambda state, device=None: None)
     library = torch.library.Library("aten", "IMPL")
     _registered.append(library)
     for name in FACTORIES:
