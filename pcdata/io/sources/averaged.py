@@ -12,7 +12,7 @@ from pcdata.errors import CaptureError, ConfigError, DTypeError, add_note
 from pcdata.files.sample_names import check_known
 from pcdata.functional.depth.average import DepthAverage, average_depth
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids, recordings_of
-from pcdata.io.sources.combine import CombinedSource
+from pcdata.io.sources.combine import DerivedSource
 from pcdata.io.sources.option_checks import check_numbers
 from pcdata.io.sources.registry import register_combinator
 from pcdata.io.sources.still_camera import check_still_camera
@@ -21,7 +21,7 @@ from pcdata.structures import Confidence, DepthFrame, confidence_of
 
 @register_combinator
 @dataclass(frozen=True, kw_only=True)
-class AveragedSource(CombinedSource):
+class AveragedSource(DerivedSource):
     """Averages every ``num_frames`` consecutive captures of a source into one with less noise and fewer holes.
 
     A sample bears the id, colors, labels, pose, mask and signals of the first capture of its group: a state and an
@@ -87,11 +87,6 @@ class AveragedSource(CombinedSource):
         for ids in recordings:
             groups |= {ids[n]: ids[n : n + self.num_frames] for n in range(0, len(ids), self.num_frames)}
         object.__setattr__(self, "_groups", groups)
-
-    @property
-    def sources(self) -> tuple[CaptureSource]:
-        """The source whose captures are averaged."""
-        return (self.source,)
 
     @property
     def ids(self) -> list[str]:

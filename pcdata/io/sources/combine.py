@@ -110,8 +110,7 @@ class Selectable(Captures, ABC, Generic[Part]):
 class CombinedSource(Selectable["SubsetSource"]):
     """Captures that are made of those of other sources; holds no capture, so it pickles as they do.
 
-    A subclass says of which (:meth:`made_of`) and how (:meth:`load`). One that is a dataclass with the field ``source``
-    and plain fields can be registered, see :func:`register_combinator`.
+    A subclass says of which (:meth:`made_of`) and how (:meth:`load`).
     """
 
     over_time: ClassVar[bool] = False  # smooths over time, which two in a row would do twice
@@ -176,7 +175,27 @@ class CombinedSource(Selectable["SubsetSource"]):
         return SubsetSource(self, ids, skipped=skipped)
 
 
-class SubsetSource(CombinedSource):
+class DerivedSource(CombinedSource):
+    """Captures that are made of those of one source, and called as they are unless a subclass says otherwise.
+
+    A subclass that is a dataclass with the field ``source`` and plain fields can be registered, see
+    :func:`register_combinator`.
+    """
+
+    source: CaptureSource
+
+    @property
+    def sources(self) -> tuple[CaptureSource]:
+        """The source alone."""
+        return (self.source,)
+
+    @property
+    def ids(self) -> list[str]:
+        """The sample ids of the source."""
+        return list(self.source.ids)
+
+
+class SubsetSource(DerivedSource):
     """Some of the captures of a source, in its order."""
 
     kind = "subset"
@@ -199,11 +218,6 @@ class SubsetSource(CombinedSource):
             lost = name_some(map(str, wanted - self._ids.keys())) or "none"
             raise CaptureError(f"SubsetSource: needs ids of {source!r}, got {lost}")
         self._skipped = dict(skipped or {})
-
-    @property
-    def sources(self) -> tuple[CaptureSource]:
-        """The source that this is a part of."""
-        return (self.source,)
 
     @property
     def ids(self) -> list[str]:

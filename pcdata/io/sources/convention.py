@@ -21,7 +21,7 @@ from pcdata.functional.depth.rendered import (
 from pcdata.geometry.camera_axes import CAMERA_AXES
 from pcdata.geometry.rigid import invert_rigid
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids
-from pcdata.io.sources.combine import CombinedSource
+from pcdata.io.sources.combine import DerivedSource
 from pcdata.io.sources.option_checks import check_numbers
 from pcdata.io.sources.registry import register_combinator
 from pcdata.io.sources.rendered_images import ROWS, centered_camera, upright_image
@@ -33,7 +33,7 @@ PRINCIPAL_POINTS = ("center", "corner")
 
 @register_combinator
 @dataclass(frozen=True, kw_only=True)
-class ConventionSource(CombinedSource):
+class ConventionSource(DerivedSource):
     """Captures of another convention, as cameras here have them.
 
     Args:
@@ -81,16 +81,6 @@ class ConventionSource(CombinedSource):
         elif self.near or self.far:
             raise ConfigError(f"{where}: near and far are of depth = {' or '.join(BUFFERS)}; leave them out")
         checked_ids(where, self.source)
-
-    @property
-    def sources(self) -> tuple[CaptureSource]:
-        """The source whose captures are converted."""
-        return (self.source,)
-
-    @property
-    def ids(self) -> list[str]:
-        """The sample ids of the source."""
-        return list(self.source.ids)
 
     def made_of(self, sample_id: str) -> list[tuple[CaptureSource, str]]:
         """Return the capture that is converted.

@@ -20,7 +20,7 @@ from pcdata.files.sample_names import check_known, name_some
 from pcdata.io.calibration.calibration_yaml import read_calibration
 from pcdata.io.calibration.droid import read_droid_extrinsics
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids, episodes_of
-from pcdata.io.sources.combine import CombinedSource
+from pcdata.io.sources.combine import DerivedSource
 from pcdata.io.sources.registry import register_combinator
 from pcdata.structures import DepthFrame
 
@@ -30,7 +30,7 @@ _Poses = dict[str, Tensor]  # by camera: (4, 4) float64, the frame from it
 
 @register_combinator
 @dataclass(frozen=True, kw_only=True)
-class _PosedSource(CombinedSource):
+class _PosedSource(DerivedSource):
     """Captures whose poses are those of a file; cameras that it does not have keep their own.
 
     A camera is found by its name or serial number, as ``provenance["cameras"]`` or ``provenance["serial"]`` has it.
@@ -93,16 +93,6 @@ class _PosedSource(CombinedSource):
             return {None: found}
         wanted = [one.id for one in episodes_of(self.source)] if not self.episode else [self.episode]
         return read_droid_extrinsics(where, path, wanted, is_stated=bool(self.episode))
-
-    @property
-    def sources(self) -> tuple[CaptureSource]:
-        """The source whose captures get other poses."""
-        return (self.source,)
-
-    @property
-    def ids(self) -> list[str]:
-        """The sample ids of the source."""
-        return list(self.source.ids)
 
     def unread(self) -> list[str]:
         """Say which episodes keep the poses that they have, besides what the source does not read."""

@@ -11,7 +11,7 @@ from pcdata.files.sample_names import check_known
 from pcdata.functional.depth.disparity import disparity_scale
 from pcdata.functional.depth.temporal import PERSISTENCE_RULES, TemporalState, checked_state, temporal_step
 from pcdata.io.sources.capture_source import CaptureSource, checked_ids, recordings_of, signals_of
-from pcdata.io.sources.combine import CombinedSource
+from pcdata.io.sources.combine import DerivedSource
 from pcdata.io.sources.option_checks import check_numbers
 from pcdata.io.sources.registry import register_combinator
 from pcdata.io.sources.still_camera import check_still_camera
@@ -79,7 +79,7 @@ class TemporalFilterDepth:
 
 @register_combinator
 @dataclass(frozen=True, kw_only=True)
-class TemporallyFilteredSource(CombinedSource):
+class TemporallyFilteredSource(DerivedSource):
     """A stream whose captures come filtered with the ``num_frames - 1`` before each of them in its recording.
 
     A window instead of all the past: every sample can be loaded alone, in any order and by any worker, with the same
@@ -115,11 +115,6 @@ class TemporallyFilteredSource(CombinedSource):
         checked_ids("TemporallyFilteredSource", self.source)
         places = {own: (ids, place) for ids in recordings_of(self.source) for place, own in enumerate(ids)}
         object.__setattr__(self, "_places", places)
-
-    @property
-    def sources(self) -> tuple[CaptureSource]:
-        """The source whose captures are filtered."""
-        return (self.source,)
 
     @property
     def ids(self) -> list[str]:

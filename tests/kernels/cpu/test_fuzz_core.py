@@ -22,7 +22,6 @@ from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.rows import ptr_from_counts
 from pcdata.geometry.lens import plain_lenses
 from pcdata.geometry.lens_models import lens_row
-from pcdata.kernels.cpu import native
 
 pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(why_unavailable("cpu")))
 
@@ -39,20 +38,12 @@ OWN_CHECKS |= {"segment_planes", "supporting_plane", "table_surface"}
 CASES = int(os.environ.get("PCDATA_FUZZ_CASES", "12"))
 
 
-@pytest.fixture(params=native.INSTRUCTION_SETS)
-def machine(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Each instruction set in turn."""
-    monkeypatch.setenv(native.FORCE_VARIABLE, request.param)
-    native.library.cache_clear()
+@pytest.fixture
+def machine(instruction_set: str) -> Iterator[str]:
+    """Each instruction set in turn, with whatever number of threads a case sets."""
     threads = torch.get_num_threads()
-    try:
-        native.library()
-    except OSError as error:
-        pytest.skip(str(error))
-    yield request.param
+    yield instruction_set
     torch.set_num_threads(threads)
-    monkeypatch.undo()
-    native.library.cache_clear()
 
 
 def depth_image(rng: np.random.Generator, height: int, width: int) -> np.ndarray:

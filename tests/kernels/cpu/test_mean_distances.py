@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -14,20 +13,6 @@ from pcdata.contracts.dispatch import why_unavailable
 from pcdata.kernels.cpu import native
 
 pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(why_unavailable("cpu")))
-
-
-@pytest.fixture(params=native.INSTRUCTION_SETS)
-def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Each instruction set that this processor runs, in turn."""
-    monkeypatch.setenv(native.FORCE_VARIABLE, request.param)
-    native.library.cache_clear()
-    try:
-        native.library()
-    except OSError as error:
-        pytest.skip(str(error))
-    yield request.param
-    monkeypatch.undo()
-    native.library.cache_clear()
 
 
 def means(points: Tensor, k: int, pixel: Tensor | None = None, width: int = 0) -> Tensor:

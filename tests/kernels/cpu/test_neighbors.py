@@ -21,7 +21,6 @@ from pcdata.contracts.dispatch import OPERATIONS, why_unavailable
 from pcdata.errors import ConfigError, ShapeError
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.rows import ptr_from_counts
-from pcdata.kernels.cpu import native
 from tests.warm import run_python
 
 pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(why_unavailable("cpu")))
@@ -34,20 +33,6 @@ def keep_threads() -> Iterator[None]:
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
-
-
-@pytest.fixture(params=native.INSTRUCTION_SETS)
-def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Each instruction set that this processor runs, in turn."""
-    monkeypatch.setenv(native.FORCE_VARIABLE, request.param)
-    native.library.cache_clear()
-    try:
-        native.library()
-    except OSError as error:
-        pytest.skip(str(error))
-    yield request.param
-    monkeypatch.undo()
-    native.library.cache_clear()
 
 
 def random_cloud(count: int, seed: int = 0, spread: float = 1.0) -> Tensor:

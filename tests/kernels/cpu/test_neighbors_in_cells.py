@@ -22,7 +22,6 @@ from pcdata.functional.clusters import dbscan
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.outliers import radius_outlier_mask
 from pcdata.functional.rows import ptr_from_counts
-from pcdata.kernels.cpu import native
 from tests.warm import run_python
 
 pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(why_unavailable("cpu")))
@@ -280,23 +279,10 @@ def scattered() -> list[tuple[Tensor, Tensor, Tensor]]:
     return found
 
 
-@pytest.mark.parametrize("name", native.INSTRUCTION_SETS)
-def test_every_instruction_set_equals_the_reference(name: str, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setenv(native.FORCE_VARIABLE, name)
-    native.library.cache_clear()
-    try:
-        native.library()
-    except OSError as error:
-        if "this processor runs" not in str(error):
-            raise
-        pytest.skip(f"this processor has no {name}")
-    else:
-        for points, mask, labels in scattered():
-            assert torch.equal(radius_outlier_mask(points, radius=0.02, backend="cpu"), mask)
-            assert torch.equal(dbscan(points, eps=0.02, min_points=5, backend="cpu"), labels)
-    finally:
-        monkeypatch.undo()
-        native.library.cache_clear()
+def test_every_instruction_set_equals_the_reference(instruction_set):
+    for points, mask, labels in scattered():
+        assert torch.equal(radius_outlier_mask(points, radius=0.02, backend="cpu"), mask)
+        assert torch.equal(dbscan(points, eps=0.02, min_points=5, backend="cpu"), labels)
 
 
 @functools.cache

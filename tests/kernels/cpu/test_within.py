@@ -11,7 +11,7 @@ from torch import Tensor
 from pcdata import functional as F
 from pcdata.contracts.dispatch import why_unavailable
 from pcdata.functional.rows import ptr_from_counts
-from tests.kernels.cpu.test_neighbors import MANY, MANY_PTR, instruction_set, random_cloud  # noqa: F401
+from tests.kernels.cpu.test_neighbors import MANY, MANY_PTR, random_cloud
 
 pytestmark = pytest.mark.skipif(why_unavailable("cpu") is not None, reason=str(why_unavailable("cpu")))
 
@@ -35,7 +35,7 @@ def test_lengths_of_any_size_list_as_the_reference_does(scale: float):
 
 
 @pytest.mark.parametrize("exclude_self", [False, True])
-def test_a_ragged_batch_is_listed_as_by_the_reference(instruction_set: str, exclude_self: bool):  # noqa: F811
+def test_a_ragged_batch_is_listed_as_by_the_reference(instruction_set: str, exclude_self: bool):
     options = {"exclude_self": exclude_self}
     assert_equal(F.radius_neighbors, MANY, MANY_PTR, radius=0.2, **options)
     assert_equal(F.radius_neighbors, MANY, MANY_PTR, radius=radii(len(MANY), 0.4), **options)
@@ -43,7 +43,7 @@ def test_a_ragged_batch_is_listed_as_by_the_reference(instruction_set: str, excl
 
 
 @pytest.mark.parametrize("spread", [0.0, 1.0, 1e4])
-def test_queries_of_their_own_have_radii_of_their_own(spread: float, instruction_set: str):  # noqa: F811
+def test_queries_of_their_own_have_radii_of_their_own(spread: float, instruction_set: str):
     counts = [(7 * cloud) % 23 for cloud in range(len(MANY_PTR) - 1)]
     queries = random_cloud(sum(counts), 5, spread)
     own = {"queries": queries, "queries_ptr": ptr_from_counts(counts), "radius": radii(len(queries), 0.5 + spread)}

@@ -1,5 +1,6 @@
 // Farthest point sampling of ragged batches.
 #include "pc/sampling/groups.hpp"
+#include "pc/sampling/picks.hpp"
 
 namespace pc::sampling {
 namespace {
@@ -8,17 +9,9 @@ constexpr int64_t kGroupsPerPiece = 8;
 // Leaves visited before Ctrl-C is looked for: about 50 ms at 25 ns each.
 constexpr int64_t kBudget = int64_t{1} << 21;
 
-struct Task {
-  FarthestSampler sampler;
-  int64_t room;  // where its points start among those of all clouds
-  int64_t* picks;
-  int64_t wanted;
-  int64_t taken;
-};
-
-void start(Task& task, sort::MortonPoints& order) {
-  FarthestSampler& sampler = task.sampler;
-  order.serial(sampler.points(), sampler.count(), task.room,
+// `room`: where its points start among those of all clouds.
+void start(FarthestSampler& sampler, sort::MortonPoints& order, int64_t room) {
+  order.serial(sampler.points(), sampler.count(), room,
                [&](const sort::PlacedPoint* points, int64_t count, int64_t at) { sampler.place(points, count, at); });
   sampler.start_leaf_groups(0, sampler.num_leaf_groups());
   sampler.start_levels();
@@ -45,28 +38,26 @@ void start_in_parallel(const pc_context& context, ScratchFrame& scratch, Farthes
 void sample(const pc_context& context, const float* points, const int64_t* ptr, int64_t num_clouds,
             const int64_t* wanted, int64_t* picks) {
   ScratchFrame scratch;
-  std::vector<Task> open;
+  std::vector<Picking<FarthestSampler>> open;
+  std::vector<int64_t> rooms;
   int64_t room = 0;
   for (int64_t cloud = 0; cloud < num_clouds; picks += wanted[cloud++]) {
     if (wanted[cloud] == 0) continue;
     const int64_t count = ptr[cloud + 1] - ptr[cloud];
-    open.push_back({FarthestSampler(scratch, points + 3 * ptr[cloud], count), room, picks, wanted[cloud], 0});
+    open.push_back({FarthestSampler(scratch, points + 3 * ptr[cloud], count), picks, wanted[cloud]});
+    rooms.push_back(room);
     room += count;
   }
   if (open.size() == 1) {
     start_in_parallel(context, scratch, open[0].sampler);
   } else {
     sort::MortonPoints order(scratch, room);
-    parallel_for(context, static_cast<int64_t>(open.size()), 1,
-                 [&](int64_t i, int64_t, int64_t) { start(open[static_cast<size_t>(i)], order); });
-  }
-  while (!open.empty()) {
     parallel_for(context, static_cast<int64_t>(open.size()), 1, [&](int64_t i, int64_t, int64_t) {
-      Task& task = open[static_cast<size_t>(i)];
-      task.taken = task.sampler.advance(task.picks, task.taken, task.wanted, kBudget);
+      const auto own = static_cast<size_t>(i);
+      start(open[own].sampler, order, rooms[own]);
     });
-    open.erase(std::remove_if(open.begin(), open.end(), [](const Task& t) { return t.taken == t.wanted; }), open.end());
   }
+  take_picks(context, open, kBudget);
 }
 
 }  // namespace

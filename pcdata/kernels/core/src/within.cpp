@@ -14,6 +14,18 @@ struct WithinCall {
   const float* radii;  // (1,) or (Q,)
   bool per_query, exclude_self;
 
+  // Searching reads leaves and boxes alone.
+  WithinCall(const pc_context& own_context, int64_t num_clouds, const float* leaves, const int64_t* leaf_ptr,
+             const float* own_boxes, const float* queries, const int64_t* query_ptr, const float* own_radii,
+             int64_t has_own_radii, int64_t is_excluded)
+      : context(own_context),
+        points(leaves_at(leaves, leaf_ptr, num_clouds)),
+        boxes(reinterpret_cast<Boxes*>(const_cast<float*>(own_boxes))),
+        groups(leaves_at(queries, query_ptr, num_clouds)),
+        radii(own_radii),
+        per_query(has_own_radii != 0),
+        exclude_self(is_excluded != 0) {}
+
   float limit(uint32_t row) const {
     const float radius = radii[per_query ? row : 0];
     return radius * radius;
@@ -56,6 +68,11 @@ struct WithinCall {
                           if (near != 0) body(lane, leaf, at, near);
                         }
                       });
+  }
+
+ private:
+  static Leaves leaves_at(const float* numbers, const int64_t* leaf_ptr, int64_t num_clouds) {
+    return {reinterpret_cast<Leaf*>(const_cast<float*>(numbers)), leaf_ptr, num_clouds};
   }
 };
 
@@ -126,14 +143,7 @@ PC_EXPORT int32_t pc_count_within(const pc_context* context, const float* leaves
   using namespace pc;
   using namespace pc::neighbors;
   return guarded([&] {
-    const auto leaf = [](const float* from) { return reinterpret_cast<Leaf*>(const_cast<float*>(from)); };
-    count_within({*context,
-                  {leaf(leaves), leaf_ptr, num_clouds},
-                  reinterpret_cast<Boxes*>(const_cast<float*>(boxes)),
-                  {leaf(groups), group_ptr, num_clouds},
-                  radii,
-                  per_query != 0,
-                  exclude_self != 0},
+    count_within({*context, num_clouds, leaves, leaf_ptr, boxes, groups, group_ptr, radii, per_query, exclude_self},
                  counts);
   });
 }
@@ -145,14 +155,7 @@ PC_EXPORT int32_t pc_list_within(const pc_context* context, const float* leaves,
   using namespace pc;
   using namespace pc::neighbors;
   return guarded([&] {
-    const auto leaf = [](const float* from) { return reinterpret_cast<Leaf*>(const_cast<float*>(from)); };
-    list_within({*context,
-                 {leaf(leaves), leaf_ptr, num_clouds},
-                 reinterpret_cast<Boxes*>(const_cast<float*>(boxes)),
-                 {leaf(groups), group_ptr, num_clouds},
-                 radii,
-                 per_query != 0,
-                 exclude_self != 0},
+    list_within({*context, num_clouds, leaves, leaf_ptr, boxes, groups, group_ptr, radii, per_query, exclude_self},
                 neighbors_ptr, index, distance);
   });
 }
