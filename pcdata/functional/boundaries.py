@@ -12,7 +12,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_count, checked_length, checked_positive
 from pcdata.errors import ConfigError
-from pcdata.functional.neighbors import nearest_rows
+from pcdata.functional.neighbor_rows import nearest_rows
 from pcdata.geometry.shape_fit import across, dot, length
 
 _ROWS = 1 << 21  # neighbors whose angles are alive at once

@@ -10,7 +10,7 @@ from torch import Tensor
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_count, checked_length, checked_positive
 from pcdata.errors import PoseError
-from pcdata.functional.neighbors import nearest_rows
+from pcdata.functional.neighbor_rows import nearest_rows
 from pcdata.functional.paired_points import checked_flag, fit_paired_points
 from pcdata.functional.rows import count_per_cloud, counts_from_ptr, transform_points
 

@@ -17,7 +17,8 @@ from pcdata.contracts.numbers import checked_count, checked_lengths, require_len
 from pcdata.contracts.on_host import bounds_of
 from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.nearest import pair_chunks
-from pcdata.functional.neighbors import ball_query, nearest_rows, radius_neighbors
+from pcdata.functional.neighbor_rows import nearest_rows
+from pcdata.functional.neighbors import ball_query, radius_neighbors
 from pcdata.functional.radius import require_extent, squared_radius
 from pcdata.functional.rows import cloud_of_rows, ptr_after_mask, ptr_from_counts, segment_sum
 

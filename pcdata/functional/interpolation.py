@@ -7,7 +7,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_count
-from pcdata.functional.neighbors import nearest_rows
+from pcdata.functional.neighbor_rows import nearest_rows
 
 
 @op(

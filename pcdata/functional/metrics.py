@@ -11,7 +11,8 @@ from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_length, checked_word
 from pcdata.errors import ShapeError
 from pcdata.functional.nearest import squared_distance
-from pcdata.functional.neighbors import finder, nearest_rows, rows_within
+from pcdata.functional.neighbor_rows import nearest_rows, rows_within
+from pcdata.functional.neighbors import finder
 from pcdata.functional.norms import norm_length
 from pcdata.functional.rows import cloud_of_rows, count_per_cloud, counts_from_ptr, segment_max
 

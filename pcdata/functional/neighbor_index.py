@@ -12,7 +12,8 @@ from pcdata.contracts.dispatch import inner
 from pcdata.contracts.numbers import checked_count
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ShapeError
-from pcdata.functional.neighbors import Listed, all_within, checked_radius, nearest, nearest_rows, rows_within
+from pcdata.functional.neighbor_rows import Listed, nearest_rows, rows_within
+from pcdata.functional.neighbors import all_within, checked_radius, nearest
 
 
 @inner

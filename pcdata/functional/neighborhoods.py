@@ -12,7 +12,8 @@ from pcdata.contracts.numbers import checked_count
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, near_matches
 from pcdata.functional.image_grid import ImageGrid, checked_grid
-from pcdata.functional.neighbors import checked_radius, finder, nearest_rows
+from pcdata.functional.neighbor_rows import nearest_rows
+from pcdata.functional.neighbors import checked_radius, finder
 
 _ROWS = 1 << 21  # neighbors whose offsets are alive at once
 _ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # of a symmetric matrix

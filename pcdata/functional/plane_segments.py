@@ -14,7 +14,7 @@ from pcdata.contracts.numbers import checked_count, checked_fraction, checked_le
 from pcdata.contracts.on_host import bounds_of
 from pcdata.errors import NoPlaneError, UnitError
 from pcdata.functional.clusters import density_clusters
-from pcdata.functional.neighbors import nearest_rows
+from pcdata.functional.neighbor_rows import nearest_rows
 from pcdata.functional.plane_arguments import checked_probability, checked_seeds, checked_tilt, checked_up
 from pcdata.functional.plane_choice import chosen_plane
 from pcdata.functional.plane_steps import near_planes, refine_planes

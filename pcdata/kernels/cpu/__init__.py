@@ -10,8 +10,10 @@ from pcdata.kernels.cpu import image_windows as cpu_image_windows
 from pcdata.kernels.cpu import images as cpu_images
 from pcdata.kernels.cpu import lenses as cpu_lenses
 from pcdata.kernels.cpu import motions as cpu_motions
+from pcdata.kernels.cpu import neighborhoods as cpu_neighborhoods
 from pcdata.kernels.cpu import neighbors as cpu_neighbors
 from pcdata.kernels.cpu import noise as cpu_noise
+from pcdata.kernels.cpu import outliers as cpu_outliers
 from pcdata.kernels.cpu import planes as cpu_planes
 from pcdata.kernels.cpu import rendering as cpu_rendering
 from pcdata.kernels.cpu import rows as cpu_rows
@@ -30,8 +32,10 @@ __all__ = [
     "cpu_images",
     "cpu_lenses",
     "cpu_motions",
+    "cpu_neighborhoods",
     "cpu_neighbors",
     "cpu_noise",
+    "cpu_outliers",
     "cpu_planes",
     "cpu_registration",
     "cpu_rendering",

@@ -14,7 +14,7 @@ import pcdata.functional.normals  # noqa: F401 - the functions must be registere
 from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.nearest import Neighbors
-from pcdata.functional.neighbors import Listed, grown_within
+from pcdata.functional.neighbor_rows import Listed, grown_within
 from pcdata.functional.radius import largest_squared
 from pcdata.kernels.cuda.launching import Launcher, launcher_of
 from pcdata.kernels.cuda.trees import BoxTree, box_tree, in_order

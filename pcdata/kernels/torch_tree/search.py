@@ -19,7 +19,7 @@ from pcdata.contracts.dispatch import INNER, kernel
 from pcdata.contracts.on_host import bounds_of, counts_of, read_together, uploaded
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.nearest import Neighbors
-from pcdata.functional.neighbors import Listed, cut_to_radii, grown_within, laid_out, widest
+from pcdata.functional.neighbor_rows import Listed, cut_to_radii, grown_within, laid_out, widest
 from pcdata.functional.radius import largest_squared
 from pcdata.functional.rows import cloud_of_rows, group_count, rows_of_mask
 from pcdata.kernels.torch_tree.boxtree import LEAF_SIZE, BoxTree, Leaves, box_gap, expand_ranges, spatial_order

@@ -1,0 +1,62 @@
+"""Kernels of what lies around points: normals, shapes of neighborhoods, clusters."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# The operations must be registered before their kernels.
+import pcdata.functional.clusters
+import pcdata.functional.neighborhoods
+import pcdata.functional.normals  # noqa: F401
+from pcdata.contracts.dispatch import INNER, kernel
+from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.radius import require_cells
+from pcdata.kernels.cpu.native import call, room, room_for
+from pcdata.kernels.cpu.search_arguments import core_rows, grid_arguments, limit_of, reachable
+
+
+@kernel("estimate_normals", "cpu")
+def estimate_normals(
+    *, points: Tensor, ptr: Tensor, radius: float | None, max_neighbors: int, grid: ImageGrid | None
+) -> Tensor:
+    """Run the reference's contract in the core."""
+    points, ptr = core_rows(points, ptr)
+    normals = room(points.shape, points.dtype)
+    most = reachable(max_neighbors, points)
+    call("pc_normals", points, ptr, len(ptr) - 1, most, limit_of(radius), *grid_arguments(grid), normals)
+    return normals
+
+
+@kernel("facing_normals", "cpu")
+def facing_normals(points: Tensor, normals: Tensor, viewpoint: Tensor) -> Tensor:
+    """Turn them in one pass; another dtype than float32 is the reference's."""
+    if any(one.dtype is not torch.float32 for one in (points, normals, viewpoint)):
+        found: Tensor = INNER["facing_normals"].reference(points, normals, viewpoint)
+        return found
+    facing, of_all = room(normals.shape, torch.float32), viewpoint.numel() == 3
+    arrays = points.contiguous(), normals.contiguous(), points.shape[0], viewpoint.contiguous()
+    call("pc_face_normals", *arrays, of_all, facing)
+    return facing
+
+
+@kernel("neighborhood_shapes", "cpu")
+def neighborhood_shapes(points: Tensor, index: Tensor, centers: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Sum up one neighborhood after another."""
+    queries, k = index.shape
+    mean, covariance = room_for(((queries, 3), torch.float32), ((queries, 3, 3), torch.float64))
+    counts = room(queries, torch.int64)
+    arrays = points.detach().contiguous(), len(points), index.contiguous(), queries, k, centers.contiguous()
+    call("pc_neighborhood_shapes", *arrays, mean, covariance, counts)
+    return mean, covariance, counts
+
+
+@kernel("density_clusters", "cpu")
+def density_clusters(points: Tensor, ptr: Tensor, eps: float, min_points: int, grid: ImageGrid | None) -> Tensor:
+    """Join cells that hold core points, then number the clusters and label their borders."""
+    label = room(len(points), torch.int64)
+    largest = room(1, torch.float64)
+    enough = min(min_points, len(points) + 1)
+    call("pc_dbscan", points, ptr, len(ptr) - 1, eps, enough, label, largest)
+    require_cells("dbscan", eps, largest.item())
+    return label
