@@ -67,17 +67,14 @@ from pcdata.functional.shapes import (
 )
 from pcdata.functional.table_surface import TableSurface, table_surface
 from pcdata.functional.visibility import frustum_mask, hidden_point_mask
-from pcdata.functional.voxels import (
-    find_voxel_size,
-    voxel_cells,
-    voxel_downsample,
+from pcdata.functional.voxel_averages import (
     voxel_majority,
     voxel_maximum,
     voxel_mean,
     voxel_mean_direction,
     voxel_minimum,
-    voxel_nearest,
 )
+from pcdata.functional.voxels import find_voxel_size, voxel_cells, voxel_downsample, voxel_nearest
 from pcdata.geometry.lens import distort_normalized, undistort_normalized
 
 __all__ = [

@@ -7,10 +7,10 @@ import math
 import torch
 from torch import Tensor
 
+from pcdata.functional.equal_rows import numbered_rows
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.neighborhoods import neighborhood_covariance
 from pcdata.functional.rows import ptr_from_counts, transform_points
-from pcdata.functional.voxels import numbered_rows
 
 _REACH = 0.008  # metres to all sides that slope and spacing are taken over: more than the noise, less than an object
 _PIXELS = (1, 12)  # the same in the image, at least and at most

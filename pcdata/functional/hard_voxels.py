@@ -12,8 +12,8 @@ from pcdata.contracts.dispatch import op
 from pcdata.contracts.numbers import checked_count, checked_edges, checked_places
 from pcdata.contracts.on_host import on_host, uploaded
 from pcdata.errors import ConfigError
+from pcdata.functional.equal_rows import numbered_in_order, voxel_keys
 from pcdata.functional.rows import cloud_of_rows, group_count, ptr_from_counts
-from pcdata.functional.voxels import group_in_row_order, voxel_keys
 
 
 class HardVoxels(NamedTuple):
@@ -87,7 +87,7 @@ def hard_voxels(
     place = ((points - lower.float()[cloud]) / edges.float()[cloud]).floor()
     row = ((place >= 0) & (place < shape[cloud])).all(1).nonzero().squeeze(1)
     owner, cell = cloud[row], place[row].long()
-    voxel, first = group_in_row_order(voxel_keys(owner, cell, len(ptr) - 1))
+    voxel, first = numbered_in_order(voxel_keys(owner, cell, len(ptr) - 1))
     # The number of each voxel among those of its cloud; rows of clouds follow one another, so voxels do too.
     counts = group_count(owner[first], len(ptr) - 1)
     number = (

@@ -14,8 +14,8 @@ from pcdata.contracts.numbers import checked_places, numbers_on_host
 from pcdata.contracts.on_host import on_host, read_together, uploaded
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, ShapeError
+from pcdata.functional.equal_rows import numbered_rows
 from pcdata.functional.rows import cloud_of_rows, group_first, rows_of_mask
-from pcdata.functional.voxels import numbered_rows
 from pcdata.threads import at_once
 
 _PAIRS = 1 << 20  # points and edges looked at together

@@ -16,8 +16,8 @@ from pcdata.contracts.numbers import checked_image_size, checked_places, checked
 from pcdata.contracts.on_host import bounds_of
 from pcdata.errors import ConfigError
 from pcdata.functional.depth.deproject import projected
+from pcdata.functional.equal_rows import numbered_rows
 from pcdata.functional.hulls import hull_surface
-from pcdata.functional.voxels import numbered_rows
 
 
 def _checked_near(where: str, name: str, arguments: Mapping[str, Any]) -> float:

@@ -1,4 +1,4 @@
-"""Thinning clouds on a voxel grid, and averaging whatever the points carry over the same voxels.
+"""Thinning clouds on a voxel grid; what the points carry is averaged in :mod:`pcdata.functional.voxel_averages`.
 
 The grid is Open3D's unless an origin is given: per cloud, it starts half a voxel below the lowest corner. A point's
 voxel is ``floor((point - origin) / voxel_size)`` in float64.
@@ -15,8 +15,8 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.numbers import checked_count, checked_edges, checked_places
-from pcdata.contracts.on_host import read_together
-from pcdata.errors import ConfigError, DTypeError, TooFewPointsError, UnitError
+from pcdata.errors import ConfigError, TooFewPointsError, UnitError
+from pcdata.functional.equal_rows import numbered_in_order, numbered_rows, ranked, voxel_keys
 from pcdata.functional.rows import (
     cloud_of_rows,
     counts_from_ptr,
@@ -53,7 +53,7 @@ def voxel_means(
     cloud, start, scaled = _scale_to_grid(points, ptr, edges, origin)
     voxel = scaled.floor()
     above = voxel - voxel.amin(0) if origin is not None and len(voxel) else voxel
-    inverse, first = group_in_row_order(voxel_keys(cloud, above, len(ptr) - 1))
+    inverse, first = numbered_in_order(voxel_keys(cloud, above, len(ptr) - 1))
     offset = ((scaled - voxel) * _FIXED_POINT).round_().long()
     members = group_count(inverse, len(first))
     mean_offset = group_sum(offset, inverse, len(first)).double() / members[:, None] / _FIXED_POINT
@@ -220,81 +220,6 @@ def voxel_nearest(
     return torch.cat([nearest, nearest.new_tensor([len(points)])])[group_first(inverse[nearest], num_voxels)]
 
 
-def voxel_mean(
-    values: Tensor,  # (N, C) float
-    inverse: Tensor,  # (N,) int64, as voxel_downsample returns it
-    num_voxels: int,
-) -> Tensor:  # (M, C) in the dtype of the values
-    """Average rows per voxel (colors, features), summed in float64; 0 for an empty voxel.
-
-    Raises:
-        DTypeError: integers, which have no mean (labels vote: :func:`voxel_majority`).
-    """
-    if not values.dtype.is_floating_point:
-        raise DTypeError(f"voxel_mean: values must be float, not {values.dtype}; labels go through voxel_majority")
-    count = group_count(inverse, num_voxels).clamp(min=1)
-    return (group_sum(values.double(), inverse, num_voxels) / count[:, None]).to(values.dtype)
-
-
-def voxel_mean_direction(
-    directions: Tensor,  # (N, 3) float, unit vectors
-    inverse: Tensor,  # (N,) int64
-    num_voxels: int,
-) -> Tensor:  # (M, 3) unit vectors
-    """Average directions per voxel and bring them back to unit length; directions that cancel give zero."""
-    total = group_sum(directions.double(), inverse, num_voxels)
-    return torch.nn.functional.normalize(total, dim=1).to(directions.dtype)
-
-
-def voxel_majority(
-    labels: Tensor,  # (N,) int64
-    inverse: Tensor,  # (N,) int64
-    num_voxels: int,
-) -> Tensor:  # (M,) int64
-    """Return the most frequent label of each voxel, the lowest among equals; -1 for an empty voxel.
-
-    Raises:
-        DTypeError: the labels are not int64.
-    """
-    if labels.dtype != torch.int64:
-        raise DTypeError(f"voxel_majority: labels must be int64, not {labels.dtype}")
-    names, rank = labels.unique(return_inverse=True)
-    num_names = max(len(names), 1)
-    pairs, votes = (inverse * num_names + rank).unique(return_counts=True)
-    voxel, rank = pairs // num_names, pairs % num_names
-    # More votes first, then the lower label: both in one number whose maximum wins.
-    ballot = votes * num_names + (num_names - 1 - rank)
-    best = torch.full((num_voxels,), -1, dtype=torch.int64, device=labels.device).scatter_reduce_(
-        0, voxel, ballot, "amax"
-    )
-    winner = num_names - 1 - best.remainder(num_names)
-    return torch.where(best < 0, -1, names[winner]) if len(names) else best
-
-
-def voxel_minimum(
-    values: Tensor,  # (N,) numbers
-    inverse: Tensor,  # (N,) int64
-    num_voxels: int,
-) -> Tensor:  # (M,) in the dtype of the values
-    """Return the lowest value of each voxel; 0 for an empty voxel."""
-    return _extreme(values, inverse, num_voxels, "amin")
-
-
-def voxel_maximum(
-    values: Tensor,  # (N,) numbers
-    inverse: Tensor,  # (N,) int64
-    num_voxels: int,
-) -> Tensor:  # (M,) in the dtype of the values
-    """Return the highest value of each voxel; 0 for an empty voxel."""
-    return _extreme(values, inverse, num_voxels, "amax")
-
-
-def _extreme(values: Tensor, inverse: Tensor, num_voxels: int, reduce: str) -> Tensor:
-    wide = values if values.is_floating_point() else values.long()
-    found = torch.zeros(num_voxels, dtype=wide.dtype, device=values.device)
-    return found.scatter_reduce(0, inverse, wide, reduce, include_self=False).to(values.dtype)
-
-
 def _count_voxels(points: Tensor, ptr: Tensor, sizes: Tensor, open_: Tensor) -> Tensor:
     """Return how many points :func:`voxel_downsample` leaves of each open cloud, for (B,) sizes, open_ (B,) bool."""
     if not bool(open_.all()):
@@ -314,15 +239,9 @@ def _require_distinct(points: Tensor, ptr: Tensor, num_points: int) -> None:
         )
 
 
-def numbered_rows(points: Tensor, ptr: Tensor) -> tuple[Tensor, int]:
-    """Number the different points (N, 3) of each cloud: (N,) int64, and how many there are."""
-    ranks = torch.stack([_rank(axis)[0] for axis in points.unbind(1)], dim=1)
-    return _rank(voxel_keys(cloud_of_rows(ptr), ranks, len(ptr) - 1))
-
-
 def _distinct_per_cloud(cloud: Tensor, voxel: Tensor, num_clouds: int) -> Tensor:
     """Count the different rows of voxel (N, 3, not negative) in each cloud, (B,) int64."""
-    rank, distinct = _rank(voxel_keys(cloud, voxel, num_clouds))
+    rank, distinct = ranked(voxel_keys(cloud, voxel, num_clouds))
     return group_count(cloud[group_first(rank, distinct)], num_clouds)
 
 
@@ -346,31 +265,3 @@ def _scale_to_grid(
             "than 2^53; is the voxel size in the unit of the points, and are there stray points?"
         )
     return cloud, origin, scaled
-
-
-def voxel_keys(cloud: Tensor, voxel: Tensor, num_clouds: int) -> Tensor:
-    """Number the pairs of cloud (N,) and voxel (N, 3, not negative) by (N,) int64 keys that never collide."""
-    key, size = cloud, num_clouds
-    (largest,) = read_together([voxel.amax(0)]) if len(voxel) else ([0, 0, 0],)
-    for axis, most in zip(voxel.long().unbind(1), largest):
-        axis_size = most + 1
-        if size * axis_size >= 2**63:
-            # Ranks are below N, so the product of two of them fits.
-            key, size = _rank(key)
-            axis, axis_size = _rank(axis)
-        key, size = key * axis_size + axis, size * axis_size
-    return key
-
-
-def _rank(values: Tensor) -> tuple[Tensor, int]:
-    distinct, rank = values.unique(return_inverse=True)
-    return rank, len(distinct)
-
-
-def group_in_row_order(key: Tensor) -> tuple[Tensor, Tensor]:
-    """Number equal keys by first appearance; return the group of each row (N,) and the first row of each group (G,)."""
-    group, num_groups = _rank(key)
-    first, order = group_first(group, num_groups).sort()
-    position = torch.empty_like(order)
-    position[order] = torch.arange(num_groups, dtype=torch.int64, device=key.device)
-    return position[group], first

@@ -10,7 +10,8 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, ShapeError
 from pcdata.functional.rows import cloud_of_rows, pad_rows, segment_min, transform_points
-from pcdata.functional.voxels import voxel_cells, voxel_mean
+from pcdata.functional.voxel_averages import voxel_mean
+from pcdata.functional.voxels import voxel_cells
 from pcdata.models.contract import InputTensor, ModelContract
 from pcdata.structures import PointCloud
 

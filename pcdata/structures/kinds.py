@@ -18,7 +18,7 @@ from torch import Tensor
 
 from pcdata.errors import ConfigError, DTypeError, near_matches
 from pcdata.functional.rows import group_first, transform_directions, transform_points
-from pcdata.functional.voxels import (
+from pcdata.functional.voxel_averages import (
     voxel_majority,
     voxel_maximum,
     voxel_mean,

@@ -35,15 +35,10 @@ from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
 from pcdata.structures.read_later import OfClouds
 from pcdata.transforms.class_checks import check_class, undeclared_streams, watched
-from pcdata.transforms.decisions import (
-    Decision,
-    Decisions,
-    Entry,
-    find_decisions,
-    histories_of,
-)
+from pcdata.transforms.decisions import Decision, Decisions, Entry
 from pcdata.transforms.field_checks import field_names, length_fields, validated_fields
 from pcdata.transforms.noted_steps import NotedSteps, read_in_histories
+from pcdata.transforms.replaying import replayed_through
 from pcdata.transforms.row_sums import row_sums
 
 Data = DepthFrame | PointCloud
@@ -221,21 +216,7 @@ class Transform(nn.Module):
             ReplayError: the history is not of these steps, or a decision cannot be carried over to the data; the error
                 says which.
         """
-        where = f"{type(self).__name__}.replay"
-        steps = self._steps_for(data)
-        histories, for_all = histories_of(where, history)
-        found = [find_decisions(where, steps, one) for one in histories]
-        # Of each cloud behind a step: whose history tells of it, and the view that it was before views were merged.
-        clouds: list[tuple[int, int | None]] = [(number, None) for number in range(len(found))]
-        levels = []
-        for position in range(len(steps) - 1, -1, -1):  # from what came out back to what went in
-            decisions = [found[number][position].of_view(view) for number, view in clouds]
-            levels.append(decisions)
-            origins = steps[position].origins(decisions)
-            clouds = [(clouds[k][0], clouds[k][1] if view is None else view) for k, view in origins]
-        for step, decisions in zip(steps, reversed(levels), strict=True):
-            data = step.replayed(data, _for_data(step, data, decisions, for_all))
-        return data
+        return replayed_through(f"{type(self).__name__}.replay", self._steps_for(data), data, history)
 
     def _steps_for(self, data: Any) -> list[Transform]:
         """The steps that data of this kind go through."""
@@ -399,20 +380,6 @@ class Transform(nn.Module):
             note = {"step": type(self).__name__, "version": self.version, "fields": told}
             own["_told"] = given, note
         return note
-
-
-def _for_data(step: Transform, data: Any, decisions: list[Decision], for_all: bool) -> Decisions:
-    """Return what a step decided about the clouds of the data, or about those that it makes of them."""
-    name = type(step).__name__
-    if step.keeps_clouds and isinstance(data, PointCloud):
-        if for_all and len(decisions) == 1:
-            decisions = decisions * data.num_clouds
-        if len(decisions) != data.num_clouds:
-            raise ReplayError(
-                f"{name}: the histories tell of {len(decisions)} clouds and there are {data.num_clouds}; give the "
-                "history of each, in their order, or that of one for all"
-            )
-    return Decisions(name, decisions)
 
 
 def unit_advice(step: Transform) -> str:

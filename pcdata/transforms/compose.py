@@ -11,10 +11,8 @@ from typing import Any
 from torch import Generator, Tensor, nn
 
 from pcdata.contracts.compiling import called_apart, is_traced
-from pcdata.contracts.known import forget, keeping_known, knowing_nothing
 from pcdata.errors import ConfigError
 from pcdata.files.opening import read_text
-from pcdata.functional.stored_rows import gather_kept
 from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import PointCloud
 from pcdata.structures.showing import shown_page
@@ -23,16 +21,9 @@ from pcdata.transforms.chain_reading import SECTIONS, steps_of_document, steps_o
 from pcdata.transforms.chain_rules import check_chain, warn_of_order
 from pcdata.transforms.decisions import Decision, Decisions, Entry, in_a_row
 from pcdata.transforms.field_checks import validated_fields
-from pcdata.transforms.fused_beginning import find_beginning, run_beginning
-from pcdata.transforms.fused_motions import motions_from, read_by_motions, run_motions
-from pcdata.transforms.fused_selections import (
-    SetAside,
-    are_many,
-    looked_at,
-    pick_together,
-    run_selections,
-    selections_from,
-)
+from pcdata.transforms.fused_beginning import find_beginning
+from pcdata.transforms.fused_motions import read_by_motions
+from pcdata.transforms.passes import run_step, run_steps
 from pcdata.yaml_nodes import Document, YamlDocument, yaml_text
 
 
@@ -103,7 +94,7 @@ class Compose(Transform):
         """Run every step from the first that takes the data; the steps record themselves, the chain adds nothing."""
         if is_traced():
             return called_apart(Compose.forward, self, data, generator=generator)
-        return self._run(data, generator)
+        return run_steps(list(self.steps), data, *self._enter(data, generator), beginning=self._beginning)
 
     def consume(
         self, data: PointCloud, *, generator: GeneratorLike | None = None, sources: Mapping[str, Tensor] | None = None
@@ -116,7 +107,14 @@ class Compose(Transform):
             sources: by the name of a field, (B,) int64 addresses where the rows of each cloud lie, in memory that
                 somebody holds; the clouds have only room for them. None = they have all.
         """
-        return self._run(data, generator, is_own=not data.points.requires_grad, sources=sources)
+        return run_steps(
+            list(self.steps),
+            data,
+            *self._enter(data, generator),
+            beginning=self._beginning,
+            is_own=not data.points.requires_grad,
+            sources=sources,
+        )
 
     def run_in_passes(
         self, data: Data, *, generator: GeneratorLike | None = None, after: Callable[[range, Any], None]
@@ -126,53 +124,7 @@ class Compose(Transform):
         Several steps may be one pass, so what lies between them is never made, and between selections fields that none
         of them looks at are missing: :meth:`step_through` makes all. It may look at data alone.
         """
-        return self._run(data, generator, after=after)
-
-    @keeping_known()
-    def _run(
-        self,
-        data: Data,
-        generator: GeneratorLike | None,
-        *,
-        is_own: bool = False,
-        sources: Mapping[str, Tensor] | None = None,
-        after: Callable[[range, Any], None] | None = None,
-    ) -> Any:
-        position, generator = self._enter(data, generator)
-        steps, told = list(self.steps), after or _nobody
-        singly = 0  # up to this step, selections are not run together: one of them refuses
-        while position < len(steps):
-            if self._beginning is not None and position == self._beginning.start:
-                begun = _begun(steps, self._beginning, data, told)
-                if begun is not None:
-                    data, position, singly = begun
-                    continue
-            together = motions_from(steps, position)
-            if together > 1 - is_own and isinstance(data, PointCloud):
-                assert generator is not None
-                generator = Streams.of(generator, num_clouds(data))
-                own = steps[position : position + together]
-                cloud = run_motions(own, data, generator, in_place=is_own, sources=sources)
-                if cloud is not None:
-                    forget()  # the memory may be that of the clouds before
-                    data, position, sources = cloud, position + together, None
-                    told(range(position - together, position), data)
-                    continue
-            if sources and isinstance(data, PointCloud):
-                gather_kept({name: getattr(data, name) for name in sources}, sources, data.ptr)
-            sources = None
-            # What a step gives may share its memory with what it got, or with its params.
-            is_own = False
-            if position >= singly and isinstance(data, PointCloud):
-                singly = position + selections_from(steps, position)
-                selected = _selected(steps, range(position, singly), data, told)
-                if selected is not None:
-                    data, position = selected
-                    continue
-            data, generator = _step(steps[position], data, generator)
-            position += 1
-            told(range(position - 1, position), data)
-        return data
+        return run_steps(list(self.steps), data, *self._enter(data, generator), beginning=self._beginning, told=after)
 
     def steps_from(self, position: int) -> Compose:
         """Return the steps from one on, for what those before it leave."""
@@ -187,7 +139,7 @@ class Compose(Transform):
         """Yield ``(step, data)`` after every step, for looking inside."""
         position, generator = self._enter(data, generator)
         for step in list(self.steps)[position:]:
-            data, generator = _step(step, data, generator)
+            data, generator = run_step(step, data, generator)
             yield step, data
 
     def _enter(self, data: Data, generator: GeneratorLike | None) -> tuple[int, GeneratorLike | None]:
@@ -329,58 +281,3 @@ class Compose(Transform):
 
     def __repr__(self) -> str:
         return f"Compose([{', '.join(map(repr, self.steps))}])"
-
-
-Told = Callable[[range, Any], None]  # positions of steps that have run, what they gave
-
-
-def _nobody(positions: range, data: Any) -> None:
-    """Hear it."""
-
-
-def _begun(steps: Sequence[Transform], beginning: slice, data: Data, told: Told) -> tuple[PointCloud, int, int] | None:
-    """Run the beginning and the selections behind it; return the cloud, the next step, and the first to be joined.
-
-    None where the steps must be run one by one.
-    """
-    stop = beginning.stop + selections_from(steps, beginning.stop)
-    done = run_beginning(steps[beginning], data, behind=steps[beginning.stop : stop])
-    if done is None:
-        return None
-    cloud, aside = done
-    told(range(beginning.start, beginning.stop), cloud)
-    if aside is None:
-        return cloud, beginning.stop, beginning.stop
-    return *run_selections(steps, range(beginning.stop, stop), cloud, aside, told), stop
-
-
-def _selected(
-    steps: Sequence[Transform], positions: range, cloud: PointCloud, told: Told
-) -> tuple[PointCloud, int] | None:
-    """Run selections together; return also the next step. None where there are not two to be run so."""
-    if len(positions) < 2:
-        return None
-    together = steps[positions.start : positions.stop]
-    parts = SetAside.of_cloud(cloud, looked_at(together)) if are_many(cloud.num_points) else None
-    if parts is not None:
-        return run_selections(steps, positions, parts[1], parts[0], told)
-    return run_selections(steps, positions, cloud, None, told) if pick_together(together) else None
-
-
-def _step(step: Transform, data: Data, generator: GeneratorLike | None) -> tuple[Data, GeneratorLike | None]:
-    own = None
-    if step.is_random:
-        # One stream per cloud, split off once: random steps in a row draw from the same streams, so that running only
-        # the random suffix on a stored prefix gives the same draws.
-        assert generator is not None
-        own = generator = Streams.of(generator, num_clouds(data))
-    if step._forward_hooks or step._forward_pre_hooks or _is_foreign(step):
-        with knowing_nothing():
-            return step(data, generator=own), generator
-    return step(data, generator=own), generator
-
-
-def _is_foreign(step: Transform) -> bool:
-    """Say whether code that is not pcdata's runs in a step: nobody knows what it does to what it has in hand."""
-    within = step.parts() if step._modules else ()
-    return any(not type(part).__module__.startswith("pcdata.") for part in (step, *within))

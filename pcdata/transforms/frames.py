@@ -13,7 +13,8 @@ from torch import Tensor
 from pcdata.contracts.on_host import bounds_of, counts_of
 from pcdata.errors import ConfigError, FrameError, PcdataError, ReplayError
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
-from pcdata.functional.voxels import voxel_downsample, voxel_majority
+from pcdata.functional.voxel_averages import voxel_majority
+from pcdata.functional.voxels import voxel_downsample
 from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, METRE, Kind, PointCloud, Signal

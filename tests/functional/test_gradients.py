@@ -13,7 +13,7 @@ from pcdata.functional.depth.disparity import depth_to_disparity, disparity_to_d
 from pcdata.functional.depth.resampling import decimate_depth, resize_depth
 from pcdata.functional.depth.sensor_noise import err_in_disparity, surface_slope
 from pcdata.functional.rows import transform_directions
-from pcdata.functional.voxels import voxel_mean
+from pcdata.functional.voxel_averages import voxel_mean
 from pcdata.geometry import rigid
 from pcdata.geometry.small_motions import motion_from_twist, twist_from_motion
 from pcdata.rng import seeded

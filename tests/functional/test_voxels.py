@@ -11,14 +11,8 @@ from hypothesis import strategies as st
 
 from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError, UnitError
 from pcdata.functional.rows import ptr_from_counts
-from pcdata.functional.voxels import (
-    find_voxel_size,
-    voxel_downsample,
-    voxel_majority,
-    voxel_mean,
-    voxel_mean_direction,
-    voxel_nearest,
-)
+from pcdata.functional.voxel_averages import voxel_majority, voxel_mean, voxel_mean_direction
+from pcdata.functional.voxels import find_voxel_size, voxel_downsample, voxel_nearest
 from pcdata.rng import seeded
 
 

@@ -96,7 +96,7 @@ def runs(monkeypatch: pytest.MonkeyPatch) -> list[PointCloud | None]:
         given.append(None if done is None else done[0])
         return done
 
-    monkeypatch.setattr("pcdata.transforms.compose.run_beginning", noted)
+    monkeypatch.setattr("pcdata.transforms.passes.run_beginning", noted)
     return given
 
 

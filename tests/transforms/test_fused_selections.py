@@ -152,7 +152,7 @@ def together(monkeypatch) -> list[list[str]]:
             found.append([type(steps[position]).__name__ for position in positions])
         return cloud, stop
 
-    monkeypatch.setattr("pcdata.transforms.compose.run_selections", noted)
+    monkeypatch.setattr("pcdata.transforms.passes.run_selections", noted)
     return found
 
 
