@@ -30,7 +30,8 @@ from pcdata.transforms.normalize import Center, NormalizeUnitSphere, NormalizeWo
 from pcdata.transforms.normals import EstimateNormals
 from pcdata.transforms.object_facts import ObjectFacts, describe_objects, label_image
 from pcdata.transforms.outliers import RemoveRadiusOutliers, RemoveStatisticalOutliers
-from pcdata.transforms.planes import RemovePlane, TiltedPlaneWarning, UnmeasuredTableWarning
+from pcdata.transforms.plane_alarms import TiltedPlaneWarning, UnmeasuredTableWarning
+from pcdata.transforms.planes import RemovePlane
 from pcdata.transforms.random_apply import RandomApply, RandomOneOf
 from pcdata.transforms.random_column import RandomColumn
 from pcdata.transforms.random_elastic import RandomElastic

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable, Collection, Sequence
 from itertools import pairwise
 from typing import Annotated, Any, Literal
@@ -17,7 +16,7 @@ from pcdata.contracts.asked_later import is_set
 from pcdata.contracts.dispatch import roomy_body
 from pcdata.contracts.host import negated
 from pcdata.contracts.on_host import bounds_of, counts_of
-from pcdata.errors import ConfigError, PcdataWarning
+from pcdata.errors import ConfigError
 from pcdata.functional.fixed_rows import FixedRows, move_kept
 from pcdata.functional.largest_planes import largest_planes
 from pcdata.functional.plane_segments import supporting_plane
@@ -38,24 +37,15 @@ from pcdata.transforms.decisions import Decisions
 from pcdata.transforms.families import GEOMETRY, RemoveTransform
 from pcdata.transforms.field_types import Count, Metres, Name, Vec3
 from pcdata.transforms.found_planes import guessed_planes, plane_facts, plane_guesses
+from pcdata.transforms.plane_alarms import warn_of_no_table, warn_of_tilt
 
 # Radians: a plane that holds `up` to within 5 degrees has no upper side; a table's or a wall's own tilt reaches that.
 _LEAST_RISE = math.radians(5)
-# From here on a plane is rather a wall than a table that a pose is wrong about.
-_WALL = math.radians(60)
 # Standard deviation of 1/z, in 1/m, that no depth camera at a table has: seven times a Kinect's, 2 cm at 1 m.
 _WORST_SENSOR = 0.02
 # Up, more or less, of a camera that is held upright, in its own axes (x right, y down, z forward): it looks level or
 # down. A wall that faces it scores low whatever the angle.
 _LIKELY_UP = (0.0, -1.0, -0.3)
-
-
-class TiltedPlaneWarning(PcdataWarning):
-    """A table that is not level: its pose, the stated up, or the choice of the plane is wrong."""
-
-
-class UnmeasuredTableWarning(PcdataWarning):
-    """A plane about which no table could be measured, so nothing was cut from it."""
 
 
 class RemovePlane(RemoveTransform):
@@ -316,62 +306,20 @@ class RemovePlane(RemoveTransform):
                 found[name] = value
         if "believed" in params:
             found["cut"] = self.cut if bool(params["believed"][b]) else "nothing"
-            self._warn_of_no_table(data, b, found["cut"])
+            if found["cut"] != self.cut:
+                warn_of_no_table(data, b, self.distance)
         if self.up is not None:
             found["tilt"] = self._tilt(plane)
-            self._warn_of_tilt(data, b, found["tilt"])
+            if self.tilt_alarm is not None and found["tilt"] > self.tilt_alarm:
+                warn_of_tilt(data, b, found["tilt"], self.up, self.frame)
         return found
-
-    def _warn_of_no_table(self, data: PointCloud, b: int, cut: str) -> None:
-        """Say that the table could not be measured."""
-        if cut == self.cut:
-            return
-        warnings.warn(
-            f"RemovePlane: cloud {b}{sample_name(data, b)}: cut='measured' found no table to measure: what lies about "
-            "the plane goes on through it, or is noisier than a depth camera is, so none of it was removed; crop to "
-            "the table before, say which plane it is by up and max_tilt, or cut='slab' to remove all that is closer "
-            f"than distance={self.distance:g}",
-            UnmeasuredTableWarning,
-            stacklevel=2,
-        )
-
-    def _warn_of_tilt(self, data: PointCloud, b: int, tilt: float) -> None:
-        """Say by how much a table leans, and what that mostly comes from."""
-        if self.tilt_alarm is None or tilt <= self.tilt_alarm:
-            return
-        turned = [step["step"] for step in data.history[b] if step["step"].startswith("Random")]
-        if tilt > _WALL:
-            cause = (
-                f"it is a wall or the side of a box, or up={self.up} is not up in frame {self.frame!r} (cameras have y "
-                "down); give max_tilt to look for a level plane, or correct up"
-            )
-        elif turned:
-            cause = f"{', '.join(turned)} before it turned the cloud; put RemovePlane before random steps"
-        elif data.frame_id == CAMERA_FRAME:
-            cause = (
-                f"the camera looks down at another angle than up={self.up} says; bring the cloud into a level frame "
-                "by ToFrame, or correct up"
-            )
-        else:
-            cause = (
-                f"the pose of the camera in {self.frame!r} is off by as much (check it: pcdata calib, pcdata "
-                "validate), or the table does lean; raise tilt_alarm if it does"
-            )
-        warnings.warn(
-            f"RemovePlane: cloud {b}{sample_name(data, b)}: the plane is tilted by {math.degrees(tilt):.1f} degrees "
-            f"from up; likely {cause}",
-            TiltedPlaneWarning,
-            stacklevel=2,
-        )
 
 
 def _viewpoints(data: PointCloud) -> Tensor | None:
     """Return one place (B, 3) for every cloud where its sensors stood, the mean of several, or None."""
     if "viewpoint" not in data.extra:
         return data.viewpoint
-    places = [part.mean(0) if len(part) else part.new_zeros(3) for part in data.extra["viewpoint"].split(_sizes(data))]
+    places = [
+        part.mean(0) if len(part) else part.new_zeros(3) for part in data.extra["viewpoint"].split(counts_of(data.ptr))
+    ]
     return torch.stack(places)
-
-
-def _sizes(data: PointCloud) -> list[int]:
-    return [int(count) for count in counts_of(data.ptr)]
