@@ -41,7 +41,7 @@ class PointGroups {
 
   // Once they are in order: place the points of some groups of leaves. Groups are independent of one another.
   void place(int64_t begin, int64_t end) {
-    constexpr int64_t kEach = FarthestSampler::kLeaf * FarthestSampler::kFan / kGroup, kAhead = 8;
+    constexpr int64_t kEach = kLeaf * kFan / kGroup, kAhead = 8;
     const int64_t last = std::min(end * kEach, num_narrow_);
     for (int64_t at = begin * kEach; at < last; ++at) {
       const float* soon = sampler_.points() + 3 * kGroup * sorted_[std::min(at + kAhead, num_narrow_ - 1)];
