@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,13 +11,14 @@ from pathlib import Path
 from pcdata.build.config import BuildConfig
 from pcdata.build.origins import Origin, origin_of
 from pcdata.build.records import BuiltSample
-from pcdata.errors import CacheError, CaptureError, ConfigError, WriteError
+from pcdata.errors import CacheError, CaptureError, ConfigError, ReplayError, WriteError
 from pcdata.files.inputs import Inputs, recording
 from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.io.store.cloud_record import Record, record_from_cloud
 from pcdata.io.writers.capture_folder import write_capture
 from pcdata.structures import DepthFrame, PointCloud, Signal
-from pcdata.transforms import Compose
+from pcdata.transforms import Compose, Transform
+from pcdata.transforms.decisions import Decision
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,7 @@ class CaptureWork:
         sample = BuiltSample(
             sample_id,
             "depth" if isinstance(capture, DepthFrame) else "cloud",
-            _counts(cloud),
+            _counts(cloud, {type(step).__name__: step for step in self.prefix.parts()}),
             time.perf_counter() - started,
             cloud.num_points,
             record.digest(),
@@ -90,12 +92,20 @@ def _one_each(cloud: PointCloud) -> Mapping[str, Signal]:
     return found
 
 
-def _counts(cloud: PointCloud) -> list[tuple[str, int]]:
-    """Return the points after every step, over all clouds."""
+def _counts(cloud: PointCloud, steps: Mapping[str, Transform]) -> list[tuple[str, int]]:
+    """Return the points after every step, over all clouds that there were then.
+
+    The clouds that a step split one into all tell what that one went through: before the split it counts once.
+    """
     counts: dict[int, tuple[str, int]] = {}
-    for history in cloud.history:
-        for position, step in enumerate(history):
-            if "points" in step:
-                before = counts.get(position, (step["step"], 0))[1]
-                counts[position] = (step["step"], before + step["points"])
+    there = list(cloud.history)
+    for position in range(max(map(len, there), default=0) - 1, -1, -1):
+        told = [history[position] for history in there if len(history) > position]
+        if known := [entry for entry in told if "points" in entry]:
+            counts[position] = (known[0]["step"], sum(entry["points"] for entry in known))
+        step = steps.get(told[0]["step"])
+        if step is not None and not step.keeps_clouds and len(told) == len(there):
+            with contextlib.suppress(ReplayError):  # a step of somebody else may not say what it split
+                origins = step.origins([Decision(entry, position) for entry in told])
+                there = [there[number] for number in dict.fromkeys(number for number, _ in origins)]
     return [counts[position] for position in sorted(counts)]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -96,5 +97,17 @@ def _named(source: Any, sample_id: str, number: int, name: str) -> Iterator[tupl
     """Load a sample; return its clouds by the names of their files."""
     data = source[number] if isinstance(source, CachedCloudDataset) else source.load(sample_id).cpu()
     clouds = clouds_of(data)
-    for view, cloud in enumerate(clouds):
-        yield (name if len(clouds) == 1 else f"{name}_view{view}"), cloud
+    for part, cloud in zip(_parts(clouds), clouds, strict=True):
+        yield name + part, cloud
+
+
+def _parts(clouds: Sequence[PointCloud]) -> list[str]:
+    """Say what each cloud is of a sample: a view of it, or an object of SplitObjects by its label, or one of a view."""
+    if len(clouds) == 1:
+        return [""]
+    objects = [cloud.meta[0].get("object") for cloud in clouds]
+    if None in objects:
+        return [f"_view{view}" for view in range(len(clouds))]
+    # Objects come view after view, each with its labels in rising order.
+    views = list(itertools.accumulate((later <= label for label, later in itertools.pairwise(objects)), initial=0))
+    return [f"_view{view}_object{label}" if views[-1] else f"_object{label}" for view, label in zip(views, objects)]

@@ -73,7 +73,7 @@ def _numbers(where: str, what: str, name: str, values: Any, *, free: bool) -> ND
         found = "a text" if not isinstance(values, Tensor) else f"of shape {tuple(values.shape[1:])}"
         raise CaptureError(
             f"{where}: {what} must be a row of numbers, but the signal {name!r} is {found}; choose another, or record "
-            "it side by side"
+            "it in a row: a pose as xyz_quat_xyzw, xyz_rot6d_rows, ... (docs/signals.md)"
         )
     row = values[0].to("cpu", torch.float64)
     narrow: NDArray[np.float32] = np.atleast_1d(row.numpy()).astype(np.float32)

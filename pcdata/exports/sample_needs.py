@@ -21,7 +21,12 @@ def one_cloud(where: str, data: Any) -> PointCloud:
         )
     if data.num_clouds != 1:
         raise ShapeError(
-            f"{where}: a sample must be one cloud, but this is a batch of {data.num_clouds}; add MergeViews()"
+            f"{where}: a sample must be one cloud, but this is a batch of {data.num_clouds}; "
+            + (
+                "after SplitObjects write each object as a file (pcdata clouds) and build from these"
+                if all("object" in meta for meta in data.meta)
+                else "add MergeViews()"
+            )
         )
     if data.num_points == 0:
         raise TooFewPointsError(f"{where}: the cloud is empty; widen the crop, or leave the sample out")

@@ -23,7 +23,7 @@ EXTENT = (0.005, WIDEST)
 _STRAY = 0.01  # share of values that sensor noise may put outside a crop or behind the camera
 _TOLERANCE = 1e-3  # of a normalized coordinate
 _PLANE_SAMPLE = 2000  # points that the search for a table looks at
-_OBJECT_STEPS = {"RemovePlane", "ClusterObjects", "SplitObjects"}
+OBJECT_STEPS = {"RemovePlane", "ClusterObjects", "SplitObjects"}
 
 # Of colors by their extremes: the encodings that they can have, narrowest first.
 _ENCODINGS = {"rgb": (0.0, 1.0), "rgb_signed": (-1.0, 1.0), "rgb_imagenet": (-2.118, 2.6401), "rgb_255": (0.0, 255.0)}
@@ -237,7 +237,7 @@ def _duplicates(clouds: list[Tensor], contract: ModelContract) -> Finding:
 
 
 def _table(batch: ModelBatch, clouds: list[Tensor], contract: ModelContract) -> Finding:
-    removed = None if batch.steps is None else bool(_OBJECT_STEPS & set(batch.steps))
+    removed = None if batch.steps is None else bool(OBJECT_STEPS & set(batch.steps))
     if contract.table == "kept":
         if removed:
             return ruled("table", "the table was removed", "leave RemovePlane out: the model expects it", found="")

@@ -9,6 +9,7 @@ from typing import Any
 from pcdata.build import BuildConfig, BuildReport, outlook
 from pcdata.files.sample_names import counted
 from pcdata.io.sources.capture_source import CaptureSource
+from pcdata.models.value_rules import OBJECT_STEPS
 from pcdata.report.inspection_text import left_out_texts, size_in_words
 from pcdata.report.plain_table import text_table
 
@@ -33,6 +34,19 @@ def build_text(report: BuildReport) -> str:
         head += f"; {report.num_finished} of {report.num_shards} shards are finished, the rest is others' work"
     tables = [head, text_table(["points after", "fewest", "median", "most"], rows)] if rows else [head]
     return "\n\n".join([*tables, *left_out_texts(report.skipped, report.quarantined)])
+
+
+def model_text(config: BuildConfig, report: BuildReport) -> str | None:
+    """Say what the model takes that no step of its preset made of the captures; None = nothing."""
+    if config.model is None or not any(sample.entered_at == "depth" for sample in report.samples):
+        return None
+    contract = config.model.contract
+    if contract.table != "removed" or OBJECT_STEPS & {type(step).__name__ for step in config.pipeline.parts()}:
+        return None
+    return (
+        f"{contract.name} takes clouds of one object, and these hold all that the captures show: cut objects out first "
+        "(docs/segmentation.md), unless the captures show one alone"
+    )
 
 
 def plan_text(config: BuildConfig, source: CaptureSource, folder: str | Path, **asked: Any) -> str:

@@ -19,6 +19,7 @@ from pcdata.build.request import BuildRequest
 from pcdata.errors import CacheError, CaptureError, ConfigError, DTypeError
 from pcdata.io.store.manifest import Manifest
 from pcdata.io.store.sample_keys import key_of
+from pcdata.synthetic import SyntheticSource
 from tests.io.forged import first_shard
 
 FORMATS = ["hdf5", "npz", "packed", "pt", "webdataset"]
@@ -97,6 +98,19 @@ def test_counts_are_told_per_step_and_captures_that_are_clouds_say_so(tmp_path, 
     depth = source.load(sample.id).depth
     assert sample.counts[0][1] == int(((depth >= 0.1) & (depth <= 3.0)).sum())
     assert build_dataset(configure(), Clouds({"a": cloud()}), tmp_path / "b").samples[0].entered_at == "cloud"
+
+
+@pytest.mark.parametrize("merged", ["", "  - MergeViews: {}\n"])
+def test_what_came_before_objects_were_split_is_counted_once(tmp_path, merged):
+    source = SyntheticSource(num_scenes=1, num_views=2, size=(60, 80))
+    text = f"depth:\n  - Deproject: {{}}\n  - ToFrame: {{frame: base}}\n{merged}  - SplitObjects: {{}}\n"
+    config = config_from_yaml(text + "  - FarthestPointSample: {num_points: 16, if_short: repeat}\n", name="split")
+    report = build_dataset(config, source, tmp_path / "out")
+    steps = config.pipeline.split()[0].step_through(source.load(source.ids[0]))
+    assert report.samples[0].counts == [(type(step).__name__, cloud.num_points) for step, cloud in steps]
+    split, sampled = report.samples[0].counts[-2:]
+    assert split[1] < report.samples[0].counts[0][1] <= 2 * 60 * 80  # no more points than pixels
+    assert sampled[1] == 16 * CachedCloudDataset(tmp_path / "out")[0].num_clouds
 
 
 def test_progress_is_told_after_every_sample(tmp_path, source, configure):

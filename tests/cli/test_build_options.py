@@ -9,9 +9,11 @@ import pytest
 from pcdata import CachedCloudDataset
 from pcdata.build import config_from_yaml
 from pcdata.cli.build import _workers
+from pcdata.io import write_capture
 from pcdata.io.store.manifest import Manifest
 from tests.build.test_builder import tree
 from tests.cli.test_cli import captures, config, run
+from tests.factories import tabletop_frame
 
 __all__ = ["captures", "config"]  # fixtures
 
@@ -35,6 +37,25 @@ def test_print_config_of_a_model_loads_again(capsys, tmp_path, model):
     code, out, _ = run(capsys, "build", "--model", model, *choices, "--print-config")
     assert code == 0
     assert config_from_yaml(out).to_yaml() == out
+
+
+@pytest.mark.parametrize(
+    ("model", "choices", "is_told"),
+    [("pointnet2_cls", [], True), ("pointnet2_semseg", [], False), ("dp3_sim", ["--set", "crop=none"], False)],
+)
+def test_a_model_of_single_objects_is_told_of_whole_scenes(capsys, tmp_path, model, choices, is_told):
+    write_capture(tabletop_frame(1), tmp_path / "taken")
+    words = ["--model", model, "--set", "frame=base", *choices, "--source", tmp_path / "taken" / "view0"]
+    code, out, err = run(capsys, "build", *words, "--out", tmp_path / "set")
+    assert code == 0, err
+    assert ("takes clouds of one object, and these hold all that the captures show" in out) == is_told
+    if is_told:  # clouds of objects are not told
+        code, out, err = run(capsys, "clouds", tmp_path / "set", "--out", tmp_path / "ply")
+        assert code == 0, err
+        words[-1] = tmp_path / "ply"
+        code, out, err = run(capsys, "build", *words, "--out", tmp_path / "objects")
+        assert code == 0, err
+        assert "one object" not in out
 
 
 def test_set_changes_settings_with_their_types(capsys, config, captures, tmp_path):

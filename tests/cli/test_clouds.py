@@ -12,8 +12,8 @@ from pcdata import Compose, open_source, read_pcd, read_ply
 from pcdata.cli.main import main
 from pcdata.exports.cloud_files import write_clouds
 from pcdata.io import write_capture
-from pcdata.structures import DepthFrame
-from pcdata.transforms import Deproject, MergeViews, ToFrame
+from pcdata.structures import DepthFrame, PointCloud
+from pcdata.transforms import Deproject, MergeViews, SplitObjects, ToFrame
 from tests.factories import tabletop_frame
 
 CONFIG = "source: {path: somewhere}\ndepth:\n  - Deproject: {}\n  - ToFrame: {frame: base}\n  - MergeViews: {}\n"
@@ -83,6 +83,25 @@ def test_views_without_poses_are_files_of_their_own(tmp_path):
     files = sorted((tmp_path / "out").iterdir())
     assert [file.stem for file in files] == ["shot_view0", "shot_view1"]
     assert all(read_ply(file).frame_id.startswith("camera") for file in files)
+
+
+class Objects:
+    """A source of one capture whose clouds are the objects of two views."""
+
+    ids = ("shot",)
+
+    def load(self, sample_id: str) -> PointCloud:
+        return Compose([Deproject(), SplitObjects()])(tabletop_frame(2))
+
+
+def test_files_of_objects_are_called_by_their_labels(tmp_path):
+    clouds = Objects().load("shot").unbatch()
+    labels = [int(cloud.labels[0]) for cloud in clouds]
+    second = next(place for place in range(1, len(labels)) if labels[place] <= labels[place - 1])
+    names = [f"shot_view{int(place >= second)}_object{label}" for place, label in enumerate(labels)]
+    assert write_clouds(Objects(), tmp_path / "out") == len(clouds)
+    for name, cloud in zip(names, clouds, strict=True):
+        assert torch.equal(read_ply(tmp_path / "out" / f"{name}.ply").points, cloud.points)
 
 
 @pytest.mark.parametrize(

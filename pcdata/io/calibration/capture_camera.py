@@ -44,8 +44,16 @@ _HINTS = {
     "factor_depth": "write metres_per_unit = 1 / factor_depth",
     "intrinsic_matrix": "write fx, fy, cx, cy as four numbers (Open3D stores the matrix column by column)",
     "k": "write fx, fy, cx, cy as four numbers",
+    "ppx": "write ppx, ppy as cx, cy",
+    "ppy": "write ppx, ppy as cx, cy",
+    "camera_matrix": "write fx, fy, cx, cy as four numbers",
     "coeffs": "write the lens coefficients as distortion",
     "dist_coeffs": "write the lens coefficients as distortion",
+}
+_SHORT_POSES = {  # by how many numbers a text has instead of sixteen
+    12: "; the last row 0 0 0 1 is missing",
+    7: "; a place and a quaternion are seven: write the matrix, "
+    "[R, t] of scipy.spatial.transform.Rotation.from_quat(q) (x y z w) over 0 0 0 1",
 }
 
 
@@ -217,8 +225,10 @@ def read_pose(path: str | os.PathLike[str]) -> Tensor:  # (4, 4) float64
     else:
         values = _numbers(where, read_text(where, path))
         if len(values) != 16:
-            short = "; the last row 0 0 0 1 is missing" if len(values) == 12 else ""
-            raise CaptureError(f"{where}: a pose must be 4x4, sixteen numbers row by row, got {len(values)}{short}")
+            raise CaptureError(
+                f"{where}: a pose must be 4x4, sixteen numbers row by row, got {len(values)}"
+                f"{_SHORT_POSES.get(len(values), '')}"
+            )
         pose = torch.tensor(values, dtype=torch.float64, device="cpu").reshape(4, 4)
     rigid.check_rigid(where, pose)
     return pose

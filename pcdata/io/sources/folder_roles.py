@@ -80,19 +80,29 @@ def check_folders(where: str, named: Any) -> dict[str, str | None]:
 
 
 def _check_lookalikes(where: str, path: Path, found: Mapping[str, Path], named: Mapping[str, str | None]) -> None:
+    alike, ways = [], []
     for entry in entries(path):
         role = next((role for role, names in _OTHER_NAMES.items() if _plain(entry.name) in names), None)
-        if role is None or role in found or role in named:
+        if role is None or role in found or role in named or role in dict(ways):
             continue
         check_links([entry])
         if not is_folder(entry):
             continue
-        usual = ROLES[role][0]
         meaning = {"pose": " (4x4 each, world from camera)", "signals": " (docs/signals.md)"}.get(role, "")
-        out = "" if role == "depth" else f"; to leave {role} out: --folder {role}= (in Python {role!r}: None)"
+        alike.append((role, f"{entry.name}/ looks like {role}, which is read from {ROLES[role][0]}/{meaning}"))
+        ways.append((role, entry.name))
+    if alike:
+        flags = " ".join(f"--folder {role}={name}" for role, name in ways)
+        one = len(ways) == 1
+        optional = [role for role, _ in ways if role != "depth"]
+        out = ""
+        if optional:
+            values = ", ".join(f"{role!r}: None" for role in optional)
+            out = f"; to leave {optional[0] if one else 'them'} out: "
+            out += f"{' '.join(f'--folder {role}=' for role in optional)} (in Python {values})"
         raise CaptureError(
-            f"{where}: {entry.name}/ looks like {role}, which is read from {usual}/{meaning}; rename it, or say "
-            f"--folder {role}={entry.name} (in Python folders={{{role!r}: {entry.name!r}}}){out}"
+            f"{where}: {'; '.join(text for _, text in alike)}; rename {'it' if one else 'them'}, or say "
+            f"{flags} (in Python folders={dict(ways)!r}){out}"
         )
 
 

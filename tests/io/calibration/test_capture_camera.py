@@ -151,6 +151,8 @@ def test_a_pose_that_is_not_rigid_is_refused_with_its_file(tmp_path: Path, pose:
 
 
 def test_a_pose_of_other_shape_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CaptureError, match="got 7; a place and a quaternion are seven: write the matrix"):
+        io.read_pose(write(tmp_path / "q.txt", "0.1 0.2 0.3 0 0 0 1"))
     with pytest.raises(CaptureError, match="got 12; the last row 0 0 0 1 is missing"):
         io.read_pose(write(tmp_path / "p.txt", "1 0 0 0 0 1 0 0 0 0 1 0"))
     np.save(tmp_path / "p.npy", np.eye(3))

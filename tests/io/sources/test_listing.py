@@ -238,6 +238,21 @@ def test_a_named_file_may_be_a_link_to_anywhere(tmp_path: Path) -> None:
     assert open_source(tmp_path / "here.ply").load("here").num_points == 5
 
 
+def test_all_folders_that_look_like_a_role_are_told_at_once_and_the_advice_works(tmp_path: Path) -> None:
+    root = folder(tmp_path / "c", ["1"])
+    (root / "poses").rename(root / "cam_poses")
+    (root / "color").rename(root / "rgb")
+    with pytest.raises(CaptureError, match=r"cam_poses/ looks like pose.*rgb/ looks like color.*rename them") as caught:
+        open_source(root, kind="folder")
+    text = str(caught.value)
+    assert (
+        "--folder pose=cam_poses --folder color=rgb (in Python folders={'pose': 'cam_poses', 'color': 'rgb'})" in text
+    )
+    assert "--folder pose= --folder color= (in Python 'pose': None, 'color': None)" in text
+    assert set(open_source(root, folders={"pose": "cam_poses", "color": "rgb"}).files("1")) >= {"pose", "color"}
+    assert not {"pose", "color"} & set(open_source(root, folders={"pose": None, "color": None}).files("1"))
+
+
 # -- what exists and is not read ---------------------------------------------------------------------------------------
 
 
