@@ -188,8 +188,8 @@ class TSDFVolume:
     def _check_frame(self, frame: DepthFrame) -> None:
         if not isinstance(frame, DepthFrame):
             raise DTypeError(
-                f"TSDFVolume.integrate takes a DepthFrame, got {type(frame).__name__}; fusing needs depth images and where each "
-                "was seen from: give the captures that the clouds are of"
+                f"TSDFVolume.integrate takes a DepthFrame, got {type(frame).__name__}; fusing needs depth images and "
+                "where each was seen from: give the captures that the clouds are of"
             )
         if frame.world_from_camera is None:
             raise FrameError(
