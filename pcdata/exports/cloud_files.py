@@ -105,8 +105,8 @@ def _parts(clouds: Sequence[PointCloud]) -> list[str]:
     """Say what each cloud is of a sample: a view of it, or an object of SplitObjects by its label, or one of a view."""
     if len(clouds) == 1:
         return [""]
-    objects = [cloud.meta[0].get("object") for cloud in clouds]
-    if None in objects:
+    objects = [int(cloud.meta[0]["object"]) for cloud in clouds if "object" in cloud.meta[0]]
+    if len(objects) < len(clouds):
         return [f"_view{view}" for view in range(len(clouds))]
     # Objects come view after view, each with its labels in rising order.
     views = list(itertools.accumulate((later <= label for label, later in itertools.pairwise(objects)), initial=0))

@@ -80,7 +80,8 @@ def check_folders(where: str, named: Any) -> dict[str, str | None]:
 
 
 def _check_lookalikes(where: str, path: Path, found: Mapping[str, Path], named: Mapping[str, str | None]) -> None:
-    alike, ways = [], []
+    alike: list[str] = []
+    ways: list[tuple[str, str]] = []
     for entry in entries(path):
         role = next((role for role, names in _OTHER_NAMES.items() if _plain(entry.name) in names), None)
         if role is None or role in found or role in named or role in dict(ways):
@@ -89,7 +90,7 @@ def _check_lookalikes(where: str, path: Path, found: Mapping[str, Path], named: 
         if not is_folder(entry):
             continue
         meaning = {"pose": " (4x4 each, world from camera)", "signals": " (docs/signals.md)"}.get(role, "")
-        alike.append((role, f"{entry.name}/ looks like {role}, which is read from {ROLES[role][0]}/{meaning}"))
+        alike.append(f"{entry.name}/ looks like {role}, which is read from {ROLES[role][0]}/{meaning}")
         ways.append((role, entry.name))
     if alike:
         flags = " ".join(f"--folder {role}={name}" for role, name in ways)
@@ -101,7 +102,7 @@ def _check_lookalikes(where: str, path: Path, found: Mapping[str, Path], named: 
             out = f"; to leave {optional[0] if one else 'them'} out: "
             out += f"{' '.join(f'--folder {role}=' for role in optional)} (in Python {values})"
         raise CaptureError(
-            f"{where}: {'; '.join(text for _, text in alike)}; rename {'it' if one else 'them'}, or say "
+            f"{where}: {'; '.join(alike)}; rename {'it' if one else 'them'}, or say "
             f"{flags} (in Python folders={dict(ways)!r}){out}"
         )
 
