@@ -5,9 +5,12 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 
 from pcdata.build import load_config
+from pcdata.cli.main import main
 from tests.warm import run_script
 
 ROOT = Path(__file__).parents[1]
@@ -22,6 +25,23 @@ def test_readme_python_blocks_run_as_one_script(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "torch.Size([2, 1024, 3]) base normalized" in done.stdout
     assert "base m [" in done.stdout
+    assert "add ToFrame(frame='base') before it" in done.stdout
+
+
+def test_the_folder_that_the_readme_shows_is_a_capture(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = re.search(r"captures/intrinsics.json +(\{.*?\})\n", README, flags=re.DOTALL)
+    assert text is not None
+    for name in ("depth", "color", "poses"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "intrinsics.json").write_text(text[1], encoding="utf-8")
+    Image.fromarray(np.full((480, 640), 700, np.uint16)).save(tmp_path / "depth" / "0000.png")
+    Image.fromarray(np.zeros((480, 640, 3), np.uint8)).save(tmp_path / "color" / "0000.jpg")
+    np.savetxt(tmp_path / "poses" / "0000.txt", np.eye(4))
+    assert main(["inspect", str(tmp_path)]) == 0
+    told = capsys.readouterr().out
+    assert "poses     lead to 'base'" in told
+    assert "unit      1 stored = 0.001 m" in told
+    assert "not read" not in told
 
 
 def test_readme_states_one_test_command_for_continuous_integration() -> None:
