@@ -90,7 +90,7 @@ def test_every_row_is_as_likely_to_be_chosen():
 
 
 @needs_core
-@pytest.mark.parametrize("size", [1, 60, 3000])
+@pytest.mark.parametrize("size", [1, 60, 150])  # 750,000 rows: some sixty pairs have equal keys
 def test_permutations_by_the_core_are_those_of_the_reference(size):
     counts = COUNTS * size
     for wanted in (counts, counts // 2, counts // 5, counts.clamp(max=1), counts.clamp(max=700), 0 * counts):
