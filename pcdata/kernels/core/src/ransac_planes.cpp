@@ -1,9 +1,9 @@
 // The plane of each cloud with the most points: drawn, counted, chosen, refined and turned in one call.
 #include <tuple>
 
+#include "pc/planes/best_of_all.hpp"
 #include "pc/planes/clouds.hpp"
 #include "pc/planes/hypotheses.hpp"
-#include "pc/planes/records.hpp"
 #include "pc/planes/tries.hpp"
 
 namespace pc::planes {
@@ -49,9 +49,9 @@ class PlaneOfCloud {
   Best best_of_all(const Hypotheses& tried, const Runs& runs, ScratchFrame& scratch) const {
     parallel_for(context_, tried.count(), 256,
                  [&](int64_t begin, int64_t end, int64_t) { tried.make(begin, end - begin); });
-    return Records(context_, runs, tried.rounded_planes(), tried.competes(), tried.count(),
-                   static_cast<float>(rules_.distance))
-        .best(scratch);
+    return BestOfAll(context_, runs, tried.rounded_planes(), tried.competes(), tried.count(),
+                     static_cast<float>(rules_.distance))
+        .find(scratch);
   }
 
   Best best_until_sure(const Hypotheses& tried) const {

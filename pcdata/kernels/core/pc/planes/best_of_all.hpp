@@ -17,11 +17,11 @@ struct Best {
   int64_t plane = 0, near = 0;
 };
 
-// Counts the points of a cloud near planes: of those that may have more of them than all before.
-class Records {
+// Finds the best of many planes of a cloud; points are counted of those that may have more than all before.
+class BestOfAll {
  public:
-  Records(const pc_context& context, const Runs& runs, const Plane* planes, const uint8_t* competes, int64_t num_planes,
-          float distance)
+  BestOfAll(const pc_context& context, const Runs& runs, const Plane* planes, const uint8_t* competes,
+            int64_t num_planes, float distance)
       : context_(context),
         runs_(runs),
         planes_(planes),
@@ -30,7 +30,7 @@ class Records {
         distance_(distance) {}
 
   // The plane with the most points near it, of those that compete; the first of equals.
-  Best best(ScratchFrame& scratch) {
+  Best find(ScratchFrame& scratch) {
     counts_ = scratch.take<int64_t>(num_planes_);
     // Runs of a small cloud tell too little to be worth a look.
     const bool is_large = runs_.num_points > kSmallCloud;
