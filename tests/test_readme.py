@@ -11,6 +11,9 @@ from PIL import Image
 
 from pcdata.build import load_config
 from pcdata.cli.main import main
+from pcdata.exports.registry import TARGETS
+from pcdata.models.catalog import CONTRACTS
+from pcdata.sensors.known_sensors import sensor_profiles
 from tests.warm import run_script
 
 ROOT = Path(__file__).parents[1]
@@ -48,6 +51,12 @@ def test_readme_states_one_test_command_for_continuous_integration() -> None:
     block = re.findall(r"^<!-- test command -->\n```bash\n(.*?)^```$", README, flags=re.MULTILINE | re.DOTALL)
     assert len(block) == 1
     assert "pytest" in block[0]
+
+
+def test_readme_counts_what_there_is() -> None:
+    assert re.search(rf"for {len(CONTRACTS)}\s+contracts", README)
+    assert f"# {len(TARGETS)} layouts" in README
+    assert f"of {len(sensor_profiles())} sensors" in README
 
 
 def test_readme_pictures_exist() -> None:

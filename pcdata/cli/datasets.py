@@ -39,7 +39,7 @@ def _demo(arguments: argparse.Namespace) -> None:
         report, batches, picture = run_demo(arguments.out, num_scenes=arguments.scenes, progress=progress)
     print(build_text(report))
     points = sum(int(batch.mask.sum()) for batch in batches)
-    print(f"\nloaded back with 2 workers: {len(batches)} batches, {points:,} augmented points")
+    print(f"\nloaded back with 2 workers, in batches of up to 4: {points:,} augmented points")
     print(f"dataset  {report.folder}  (python {Path(report.folder, 'load.py')} loads it)")
     print(f"picture  {picture}")
     print(f"look     pcdata report {quote(str(report.folder))}, or pcdata view {quote(str(report.folder))}")

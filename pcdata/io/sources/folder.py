@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
 from pcdata.io.arrays.signal_files import read_signals
 from pcdata.io.calibration.capture_camera import REMARKS_OF, read_camera, read_capture_camera
 from pcdata.io.images.reading import read_depth
+from pcdata.io.sources.example_calibration import example_calibration
 from pcdata.io.sources.folder_roles import ROLES, role_folders
 from pcdata.io.sources.frame_files import make_frame
 from pcdata.io.sources.listing import (
@@ -38,7 +40,6 @@ from pcdata.structures import CAMERA_FRAME, Camera, DepthFrame, Signal
 from pcdata.structures.calibration import Calibration
 
 _CALIBRATIONS = ("intrinsics.json", "camera.json")
-_EXAMPLE = '{"width": 640, "height": 480, "fx": 600, "fy": 600, "cx": 320, "cy": 240, "metres_per_unit": 0.001}'
 
 
 @register_layout
@@ -99,7 +100,7 @@ class FolderSource(Source):
             found = "both" if present else "neither"
             raise CaptureError(
                 f"folder source {path}: needs intrinsics.json or camera.json, but {found} is there"
-                + ("" if present else f"; with the numbers of this camera, such as {_EXAMPLE}")
+                + ("" if present else f"; {example_calibration(path, [path])}")
             )
         allowed = [path, *link_targets(links_to)]
         check_inside(str(path), present[0], allowed)
@@ -165,7 +166,8 @@ class FolderSource(Source):
 
     def unread(self) -> list[str]:
         """Name the folders and files beside those that are read."""
-        return unread_entries(self.path, self._used)
+        unread = unread_entries(self.path, self._used)
+        return unread if "pose" in self._files else list(map(_told_of_poses, unread))
 
     def load(self, sample_id: str) -> DepthFrame:
         """Read one sample, always a depth frame.
@@ -233,3 +235,10 @@ def _override(
         )
     pose = known.transform(frame, name) if frame and known.transforms else None
     return camera, pose, {"calibration": origin, "camera": name}
+
+
+def _told_of_poses(name: str) -> str:
+    """Say where poses belong, of a file that seems to hold them all."""
+    if not re.search(r"pose|trajectory|extrinsic", name, re.IGNORECASE) or name.endswith("/"):
+        return name
+    return f"{name}; poses are read from poses/NAME.txt: 4x4 each, world from camera"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 from pathlib import Path
 
@@ -236,6 +237,35 @@ def test_validate_reads_nothing_outside(tmp_path: Path) -> None:
 def test_a_named_file_may_be_a_link_to_anywhere(tmp_path: Path) -> None:
     (tmp_path / "here.ply").symlink_to(clouds(tmp_path / "c") / "9.ply")
     assert open_source(tmp_path / "here.ply").load("here").num_points == 5
+
+
+def test_numbers_of_a_text_beside_a_plain_capture_are_told_and_what_is_told_can_be_read(tmp_path: Path) -> None:
+    root = folder(tmp_path / "c", ["1"])
+    (root / "intrinsics.json").unlink()
+    with pytest.raises(CaptureError, match="with the numbers of this camera, such as"):
+        open_source(root, kind="folder")
+    (root / "camera_intrinsics.txt").write_text("611.345748 0 4.25\n0 612.5 3.5\n0 0 1\n")
+    with pytest.raises(CaptureError, match=r"with the numbers of camera_intrinsics\.txt: ") as caught:
+        open_source(root)
+    told = re.search(r"\{.*\}", str(caught.value))
+    assert told is not None
+    (root / "intrinsics.json").write_text(told[0])
+    camera = open_source(root)[0].camera
+    expected = [[611.345748, 0, 4.25], [0, 612.5, 3.5], [0, 0, 1]]
+    np.testing.assert_allclose(camera.intrinsics[0].numpy(), expected, rtol=1e-6)
+    (root / "intrinsics.json").unlink()
+    (root / "camera_intrinsics.txt").write_text("not a matrix")
+    with pytest.raises(CaptureError, match="with the numbers of this camera, such as"):
+        open_source(root, kind="folder")
+
+
+def test_a_file_that_seems_to_hold_all_poses_is_told_with_where_poses_belong(tmp_path: Path) -> None:
+    root = folder(tmp_path / "c", ["1"])
+    (root / "poses.json").write_text("{}")
+    assert open_source(root).unread() == ["poses.json"]  # poses are there
+    shutil.rmtree(root / "poses")
+    (told,) = open_source(root).unread()
+    assert told == "poses.json; poses are read from poses/NAME.txt: 4x4 each, world from camera"
 
 
 def test_all_folders_that_look_like_a_role_are_told_at_once_and_the_advice_works(tmp_path: Path) -> None:
