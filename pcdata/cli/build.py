@@ -126,7 +126,7 @@ def _build(arguments: argparse.Namespace) -> int:
     from pcdata.files.urls import is_in_process
     from pcdata.io.sources.capture_source import unread_of
     from pcdata.io.store.url_dataset import is_read_at_urls
-    from pcdata.report.build_text import build_text, model_text, plan_text
+    from pcdata.report.build_text import build_text, notes_of, plan_text
 
     config = _config(arguments)
     if arguments.print_config:
@@ -163,8 +163,8 @@ def _build(arguments: argparse.Namespace) -> int:
         print(f"\ndataset  {report.folder}{loads}")
         if not isinstance(report.folder, Path) and not is_read_at_urls(config.output.format):
             print(f"         {config.output.format} is read from a copy on the disk; webdataset also where it is")
-        if (text := model_text(config, report)) is not None:
-            print(f"note     {text}")
+        for note in notes_of(config, report):
+            print(f"note     {note}")
         if report.quarantined and isinstance(report.folder, Path):
             print("         once the cause is mended, the same command with --retry-quarantined tries those again")
     return QUARANTINED if report.quarantined and arguments.max_bad is None else 0

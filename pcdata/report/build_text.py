@@ -7,7 +7,7 @@ from statistics import median
 from typing import Any
 
 from pcdata.build import BuildConfig, BuildReport, outlook
-from pcdata.files.sample_names import counted
+from pcdata.files.sample_names import counted, name_some
 from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.models.value_rules import OBJECT_STEPS
 from pcdata.report.inspection_text import left_out_texts, size_in_words
@@ -36,8 +36,13 @@ def build_text(report: BuildReport) -> str:
     return "\n\n".join([*tables, *left_out_texts(report.skipped, report.quarantined)])
 
 
-def model_text(config: BuildConfig, report: BuildReport) -> str | None:
-    """Say what the model takes that no step of its preset made of the captures; None = nothing."""
+def notes_of(config: BuildConfig, report: BuildReport) -> list[str]:
+    """Say what was stored as asked and yet is not what training takes."""
+    return [note for note in (_whole_scenes(config, report), _too_few_points(config, report)) if note is not None]
+
+
+def _whole_scenes(config: BuildConfig, report: BuildReport) -> str | None:
+    """Say that the model takes single objects, where no step cut any out of depth images."""
     if config.model is None or not any(sample.entered_at == "depth" for sample in report.samples):
         return None
     contract = config.model.contract
@@ -47,6 +52,23 @@ def model_text(config: BuildConfig, report: BuildReport) -> str | None:
         f"{contract.name} takes clouds of one object, and these hold all that the captures show: cut objects out first "
         "(docs/segmentation.md), unless the captures show one alone"
     )
+
+
+def _too_few_points(config: BuildConfig, report: BuildReport) -> str | None:
+    """Say which samples a random step will refuse whenever they are read."""
+    for step in config.pipeline.split()[1].steps:
+        name, wanted = type(step).__name__, getattr(step, "num_points", None)
+        if isinstance(wanted, int) and getattr(step, "if_short", None) == "error" and not hasattr(step, "spread"):
+            short = [
+                f"{sample.id!r} ({sample.num_points:,})" for sample in report.samples if sample.num_points < wanted
+            ]
+            if short:
+                way = "leave them out with --skip ID" + ("" if config.model else f", or choose if_short of {name}")
+                return (
+                    f"{counted(len(short), 'sample')} will be refused when read, having fewer than the {wanted:,} "
+                    f"points that {name} takes: {name_some(short)}; {way}"
+                )
+    return None
 
 
 def plan_text(config: BuildConfig, source: CaptureSource, folder: str | Path, **asked: Any) -> str:

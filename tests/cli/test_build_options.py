@@ -9,6 +9,7 @@ import pytest
 from pcdata import CachedCloudDataset
 from pcdata.build import config_from_yaml
 from pcdata.cli.build import _workers
+from pcdata.errors import TooFewPointsError
 from pcdata.io import write_capture
 from pcdata.io.store.manifest import Manifest
 from tests.build.test_builder import tree
@@ -56,6 +57,25 @@ def test_a_model_of_single_objects_is_told_of_whole_scenes(capsys, tmp_path, mod
         code, out, err = run(capsys, "build", *words, "--out", tmp_path / "objects")
         assert code == 0, err
         assert "one object" not in out
+
+
+def test_samples_that_training_will_refuse_are_told(capsys, config, captures, tmp_path):
+    whole = config.read_text()
+    config.write_text(whole[: whole.index("augment:")] + "augment: [{RandomSample: {num_points: 100000}}]\n")
+    code, out, err = run(capsys, "build", config, "--source", captures, "--out", tmp_path / "short")
+    assert code == 0, err
+    with pytest.raises(TooFewPointsError):
+        CachedCloudDataset(tmp_path / "short", seed=0)[0]
+    dataset = CachedCloudDataset(tmp_path / "short", augment=None)
+    count = dataset[0].num_points
+    assert (
+        f"note     {len(dataset)} samples will be refused when read, having fewer than the 100,000 points that" in out
+    )
+    assert f"'{dataset.ids[0]}' ({count:,})" in out
+    config.write_text(config.read_text().replace("100000", str(count)))
+    code, out, err = run(capsys, "build", config, "--source", captures, "--out", tmp_path / "enough")
+    assert code == 0, err
+    assert "will be refused" not in out
 
 
 def test_set_changes_settings_with_their_types(capsys, config, captures, tmp_path):
