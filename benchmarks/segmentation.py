@@ -4,7 +4,8 @@
 
 Scenes: the Object Segmentation Database as modified by Alexandrov (`osd/`, or --osd FOLDER); a number says its kind.
 One set of numbers for all of them. `heaps`: 20 touching objects, rendered in 4 views that are merged. `kinds` fits
-three numbers on three kinds of scenes and scores the fourth. Prints tables and writes results/segmentation.json.
+three numbers on three kinds of scenes and scores the fourth. `enlarged`: the same scenes as a stereo camera whose depth
+lies on the pixels of color would give them, smoothed and enlarged. Prints tables and writes results/segmentation.json.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from unittest import mock
 import numpy as np
 import torch
 from PIL import Image, ImageDraw
-from scipy.ndimage import binary_dilation, distance_transform_edt
+from scipy.ndimage import binary_dilation, distance_transform_edt, uniform_filter
 from torch import Tensor
 
 import pcdata
@@ -52,9 +53,14 @@ from pcdata.validation import SegmentationScores, mean_scores, score_segmentatio
 
 OUTLINES = Path(__file__).parent / "apc_outlines.json"  # frame -> object -> corners (u, v), the nearest object last
 RESULT = Path(__file__).parent / "results" / "segmentation.json"
-PARTS = ("table", "time", "ablation", "kinds", "other", "heaps")
+PARTS = ("table", "time", "ablation", "kinds", "other", "enlarged", "heaps")
 HEAPS = {"seen while the method was made": range(6), "unseen": range(100, 106)}  # seeds
 HEAP_SENSORS = ("kinect_v1", "realsense_d415")
+ENLARGED = {  # pixels that depth is smoothed over, and how many times as large it then is
+    "enlarged": (1, 2.133),
+    "smoothed over 3 pixels": (3, 1.0),
+    "smoothed over 3, enlarged": (3, 2.133),
+}
 KINDS = {"boxes": range(17), "stacked": range(17, 25), "occluded": range(25, 33), "cylinders": range(33, 45)}
 SHOWN = ("overlap_f", "boundary_f", "found", "mean_iou")
 HEAP_SHOWN = ("overlap_f", "found", "mean_iou")  # a merged cloud has no boundaries
@@ -95,6 +101,8 @@ def main() -> None:
             found["kinds"] = cross_validation(without_table)
     if "other" in arguments.parts:
         found["other"] = other_sensors(Path(os.environ["PCDATA_TEST_DATA"]))
+    if "enlarged" in arguments.parts:
+        found["enlarged"] = enlarged(scenes)
     if "heaps" in arguments.parts:
         found["heaps"] = heaps(arguments.limit or 1)
     if arguments.osd is None and arguments.limit is None:
@@ -488,6 +496,51 @@ def apc(data: Path) -> Iterator[Other]:
         seen = frame.depth[0] > 0
         for what, truth in (("masks", masks), ("outlines", outlined)):
             yield f"apc {sample[-2:]} {what}", frame, truth, (truth < 0) | ~seen, [TABLE]
+
+
+# -- the scenes as a stereo camera gives them, on the pixels of color --------------------------------------------------
+
+
+def enlarged(scenes: list[Scene]) -> dict[str, Any]:
+    """Score the scenes with 1/z averaged over windows, as stereo matching does, and every reading repeated."""
+    steps = Compose([Deproject(), TABLE, ClusterObjects(split_touching=True, max_size=1_000_000)])
+    result: dict[str, Any] = {}
+    for name, (window, times) in ENLARGED.items():
+        scores = {}
+        for scene, _, cloud, truth in scenes:
+            frame, labels = enlarged_frame(cloud, truth, window, times)
+            found = steps(frame)
+            guess = torch.full((labels.numel(),), -1)
+            guess[found.source_index] = found.labels
+            scores[scene] = score_segmentation(guess.reshape(labels.shape), labels, ignore=frame.depth[0] <= 0)
+        each = {scene: round(one.overlap_f, 4) for scene, one in scores.items()}
+        result[name] = {"mean": mean_scores([*scores.values()]), "overlap_f": each}
+    rows = [[name, *(f"{one['mean'][key]:.3f}" for key in SHOWN)] for name, one in result.items()]
+    print(text_table(("the same scenes", *SHOWN), rows))
+    return result
+
+
+def enlarged_frame(cloud: PointCloud, truth: Tensor, window: int, times: float) -> tuple[DepthFrame, Tensor]:
+    """Return a scene's depth, smoothed and with neighbors repeated, and its truth on those pixels."""
+    assert cloud.source_index is not None
+    height, width = cloud.meta[0]["organized_size"]
+    pixel, points = cloud.source_index.numpy(), cloud.points.double().numpy()
+    seen = np.isfinite(points[:, 2]) & (points[:, 2] > 0)
+    inverse, labels = np.zeros(height * width), np.full(height * width, -1)
+    inverse[pixel[seen]], labels[pixel] = 1 / points[seen, 2], truth.numpy()
+    k = np.eye(3)
+    for axis, place in enumerate((pixel % width, pixel // width)):  # pixels are linear in x/z and y/z
+        along = points[seen, axis] / points[seen, 2]
+        focal, middle = np.polyfit(along, place[seen], 1)
+        k[axis, axis], k[axis, 2] = focal * times, (middle + 0.5) * times - 0.5
+    inverse = inverse.reshape(height, width)
+    there = inverse > 0
+    share = uniform_filter(there.astype(float), window)
+    inverse = np.where(there, uniform_filter(inverse, window) / np.maximum(share, 1e-9), 0)
+    rows, columns = ((np.arange(int(size * times)) / times).astype(int) for size in (height, width))
+    depth = np.where(there, 1 / np.where(there, inverse, 1), 0).astype(np.float32)[np.ix_(rows, columns)]
+    labels = labels.reshape(height, width)[np.ix_(rows, columns)]
+    return DepthFrame.from_numpy(np.ascontiguousarray(depth), k), torch.from_numpy(labels.copy())
 
 
 # -- heaps that several cameras saw -----------------------------------------------------------------------------------
