@@ -259,6 +259,61 @@ def test_numbers_of_a_text_beside_a_plain_capture_are_told_and_what_is_told_can_
         open_source(root, kind="folder")
 
 
+MATRIX = "611.3 0 4.25 0 612.5 3.5 0 0 1"
+OWN = {"width": 8, "height": 6, "fx": 10, "fy": 10, "cx": 3.5, "cy": 2.5, "metres_per_unit": 0.00012498664727900177}
+
+
+@pytest.mark.parametrize(
+    "beside",
+    [
+        {"intrinsics_color.txt": MATRIX},
+        {"rgb_intrinsics.txt": MATRIX},
+        {"ir-intrinsics.txt": MATRIX},
+        {"intrinsics_a.txt": MATRIX, "intrinsics_b.txt": MATRIX.replace("611", "605")},
+        {"intrinsics_a.txt": MATRIX, "intrinsics_b.txt": "unreadable"},
+        {"intrinsics.txt": "1165 0 12.2 0 1165 9.1 0 0 1"},  # of an image three times as large
+        {"intrinsics.txt": "nan 0 4 0 600 3 0 0 1"},
+        {"intrinsics.txt": "1e39 0 4 0 inf 3 0 0 1"},
+        {"intrinsics.txt": MATRIX + " " * (1 << 20)},
+        {"intrinsics.txt": "\0\ud800"},
+        {"camera_1.json": json.dumps(OWN | {"width": 16})},
+        {"camera_1.json": json.dumps(OWN | {"depth_encoding": "rotated_left_3"})},
+        {"camera_1.json": json.dumps(OWN | {"invalid_values": [65535]})},
+    ],
+)
+def test_numbers_that_may_not_be_those_of_the_depth_camera_are_not_told(tmp_path: Path, beside: dict[str, str]) -> None:
+    root = folder(tmp_path / "c", ["1"])
+    (root / "intrinsics.json").unlink()
+    for name, text in beside.items():
+        (root / name).write_bytes(text.encode("utf-8", "surrogatepass"))
+    with pytest.raises(CaptureError, match="with the numbers of this camera, such as"):
+        open_source(root, kind="folder")
+
+
+@pytest.mark.parametrize("link", ["intrinsics.txt", "depth/0.png", "depth"])
+def test_no_numbers_are_told_of_what_lies_outside(tmp_path: Path, link: str) -> None:
+    outside = folder(tmp_path / "outside", ["0"])
+    (outside / "intrinsics.txt").write_text(MATRIX)
+    root = folder(tmp_path / "c", ["1"])
+    (root / "intrinsics.json").unlink()
+    (root / "intrinsics.txt").write_text(MATRIX)
+    if (root / link).is_dir():
+        shutil.rmtree(root / link)
+    (root / link).unlink(missing_ok=True)
+    (root / link).symlink_to(outside / link)
+    with pytest.raises(CaptureError, match="with the numbers of this camera, such as"):
+        open_source(root, kind="folder")
+
+
+def test_what_a_file_in_our_own_form_states_is_told_to_the_last_digit(tmp_path: Path) -> None:
+    root = folder(tmp_path / "c", ["1"])
+    (root / "intrinsics.json").unlink()
+    (root / "camera_1\n.json").write_text(json.dumps(OWN))
+    with pytest.raises(CaptureError, match=r"with the numbers of 'camera_1\\n\.json': ") as caught:
+        open_source(root, kind="folder")
+    assert json.loads(re.search(r"\{.*\}", str(caught.value))[0]) == OWN
+
+
 def test_a_file_that_seems_to_hold_all_poses_is_told_with_where_poses_belong(tmp_path: Path) -> None:
     root = folder(tmp_path / "c", ["1"])
     (root / "poses.json").write_text("{}")
