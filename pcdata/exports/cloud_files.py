@@ -76,10 +76,12 @@ def write_clouds(
     check_apart(_WHERE, folder, source.folder if isinstance(source, CachedCloudDataset) else source)
     ids = list(source.ids) if isinstance(source, CachedCloudDataset) else checked_ids(_WHERE, source)
     written = 0
+    names = file_names(ids)
+    taken = {name.casefold() for name in names}
     with complete_or_nothing(folder) as partial:
-        for done, (sample_id, name) in enumerate(zip(ids, file_names(ids), strict=True), 1):
+        for done, (sample_id, name) in enumerate(zip(ids, names, strict=True), 1):
             try:
-                for place, cloud in _named(source, sample_id, done - 1, name):
+                for place, cloud in _named(source, sample_id, done - 1, name, taken):
                     _FORMATS[to](partial / f"{place}.{to}", cloud, **options)
                     written += 1
             except PcdataError as error:
@@ -93,21 +95,38 @@ def write_clouds(
     return written
 
 
-def _named(source: Any, sample_id: str, number: int, name: str) -> Iterator[tuple[str, PointCloud]]:
-    """Load a sample; return its clouds by the names of their files."""
+def _named(source: Any, sample_id: str, number: int, name: str, taken: set[str]) -> Iterator[tuple[str, PointCloud]]:
+    """Load a sample; return its clouds by the names of their files, and take those that no other may have."""
     data = source[number] if isinstance(source, CachedCloudDataset) else source.load(sample_id).cpu()
     clouds = clouds_of(data)
+    if len(clouds) == 1:  # the name of the sample, taken from the start
+        yield name, clouds[0]
+        return
     for part, cloud in zip(_parts(clouds), clouds, strict=True):
-        yield name + part, cloud
+        place = name + part
+        while place.casefold() in taken:  # another sample is called so
+            place = f"{name}_{place[len(name) :]}"
+        taken.add(place.casefold())
+        yield place, cloud
 
 
 def _parts(clouds: Sequence[PointCloud]) -> list[str]:
     """Say what each cloud is of a sample: a view of it, or an object of SplitObjects by its label, or one of a view."""
-    if len(clouds) == 1:
-        return [""]
-    objects = [int(cloud.meta[0]["object"]) for cloud in clouds if "object" in cloud.meta[0]]
+    objects = [found for cloud in clouds if (found := _object_of(cloud)) is not None]
     if len(objects) < len(clouds):
         return [f"_view{view}" for view in range(len(clouds))]
-    # Objects come view after view, each with its labels in rising order.
-    views = list(itertools.accumulate((later <= label for label, later in itertools.pairwise(objects)), initial=0))
-    return [f"_view{view}_object{label}" if views[-1] else f"_object{label}" for view, label in zip(views, objects)]
+    views = list(itertools.accumulate((rank == 0 for _, rank in objects[1:]), initial=0))
+    return [
+        f"_view{view}_object{label}" if views[-1] else f"_object{label}"
+        for view, (label, _) in zip(views, objects, strict=True)
+    ]
+
+
+def _object_of(cloud: PointCloud) -> tuple[int, int] | None:
+    """Return the label of the object that SplitObjects made a cloud of, and its place among those of its view."""
+    for step in reversed(cloud.history[0]):
+        if step["step"] == "SplitObjects":
+            params = step.get("params", {})
+            label, rank = params.get("label"), params.get("rank")
+            return (label, rank) if isinstance(label, int) and isinstance(rank, int) else None
+    return None

@@ -104,6 +104,50 @@ def test_files_of_objects_are_called_by_their_labels(tmp_path):
         assert torch.equal(read_ply(tmp_path / "out" / f"{name}.ply").points, cloud.points)
 
 
+class Clouds:
+    """A source of clouds in memory."""
+
+    def __init__(self, clouds: dict[str, PointCloud]) -> None:
+        self.clouds, self.ids = clouds, list(clouds)
+
+    def load(self, sample_id: str) -> PointCloud:
+        return self.clouds[sample_id]
+
+
+def test_no_file_of_a_part_takes_the_name_of_another_sample(tmp_path):
+    both = Compose([Deproject()])(tabletop_frame(2))
+    first, second = both.unbatch()
+    objects = SplitObjects()(first)
+    label = int(objects.labels[0])
+    clouds = {"a": objects, f"a_object{label}": second, "b": both, "b_view0": SplitObjects()(both), "b_view1": first}
+    count = write_clouds(Clouds(clouds), tmp_path / "out")
+    names = sorted(file.stem for file in (tmp_path / "out").iterdir())
+    assert len({name.casefold() for name in names}) == count == sum(cloud.num_clouds for cloud in clouds.values())
+    found = {name: read_ply(tmp_path / "out" / f"{name}.ply").points for name in names}
+    assert torch.equal(found[f"a_object{label}"], second.points)
+    assert torch.equal(found[f"a__object{label}"], objects.unbatch()[0].points)
+    assert torch.equal(found["b_view1"], first.points)
+    assert torch.equal(found["b__view1"], second.points)
+
+
+def test_one_object_of_each_of_two_views_is_told_with_its_view(tmp_path):
+    both = Compose([Deproject()])(tabletop_frame(2))
+    labels = [int(view.labels.max()) for view in both.unbatch()]
+    wanted = torch.cat([(view.labels == label) for view, label in zip(both.unbatch(), labels, strict=True)])
+    one_each = SplitObjects()(replace(both, labels=torch.where(wanted, both.labels, -1)))
+    assert write_clouds(Clouds({"shot": one_each}), tmp_path / "out") == 2
+    assert sorted(file.stem for file in (tmp_path / "out").iterdir()) == [
+        f"shot_view{view}_object{label}" for view, label in enumerate(labels)
+    ]
+
+
+@pytest.mark.parametrize("told", ["mug", None, [1], 3])
+def test_what_others_call_an_object_names_no_file(tmp_path, told):
+    both = Compose([Deproject()])(tabletop_frame(2)).with_meta([{"object": told}] * 2)
+    write_clouds(Clouds({"shot": both}), tmp_path / "out")
+    assert sorted(file.stem for file in (tmp_path / "out").iterdir()) == ["shot_view0", "shot_view1"]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
