@@ -58,6 +58,8 @@ def _too_few_points(config: BuildConfig, report: BuildReport) -> str | None:
     """Say which samples a random step will refuse whenever they are read."""
     for step in config.pipeline.split()[1].steps:
         name, wanted = type(step).__name__, getattr(step, "num_points", None)
+        if wanted is not None and getattr(step, "if_short", "error") != "error":
+            break  # those behind it get as many as it fills up to
         if isinstance(wanted, int) and getattr(step, "if_short", None) == "error" and not hasattr(step, "spread"):
             short = [
                 f"{sample.id!r} ({sample.num_points:,})" for sample in report.samples if sample.num_points < wanted

@@ -72,7 +72,13 @@ def test_samples_that_training_will_refuse_are_told(capsys, config, captures, tm
         f"note     {len(dataset)} samples will be refused when read, having fewer than the 100,000 points that" in out
     )
     assert f"'{dataset.ids[0]}' ({count:,})" in out
-    config.write_text(config.read_text().replace("100000", str(count)))
+    filled = "[{RandomSample: {num_points: 100001, if_short: repeat}}, {RandomSample: {num_points: 100000}}]"
+    config.write_text(whole[: whole.index("augment:")] + f"augment: {filled}\n")
+    code, out, err = run(capsys, "build", config, "--source", captures, "--out", tmp_path / "filled")
+    assert code == 0, err
+    assert "will be refused" not in out
+    assert CachedCloudDataset(tmp_path / "filled", seed=0)[0].num_points == 100000
+    config.write_text(whole[: whole.index("augment:")] + f"augment: [{{RandomSample: {{num_points: {count}}}}}]\n")
     code, out, err = run(capsys, "build", config, "--source", captures, "--out", tmp_path / "enough")
     assert code == 0, err
     assert "will be refused" not in out

@@ -40,6 +40,9 @@ from pcdata.structures import CAMERA_FRAME, Camera, DepthFrame, Signal
 from pcdata.structures.calibration import Calibration
 
 _CALIBRATIONS = ("intrinsics.json", "camera.json")
+_POSES = re.compile(
+    r"(?<![A-Za-z])pose|Pose|POSE|(?i:trajectory|extrinsic)"
+)  # a word of its own, not in docker-compose
 
 
 @register_layout
@@ -239,6 +242,6 @@ def _override(
 
 def _told_of_poses(name: str) -> str:
     """Say where poses belong, of a file that seems to hold them all."""
-    if not re.search(r"pose|trajectory|extrinsic", name, re.IGNORECASE) or name.endswith("/"):
+    if not _POSES.search(name) or name.endswith("/"):
         return name
     return f"{name}; poses are read from poses/NAME.txt: 4x4 each, world from camera"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path, PurePath
+from shlex import quote
 from typing import Any
 
 from pcdata.errors import CaptureError, ConfigError, near_matches
@@ -93,7 +94,7 @@ def _check_lookalikes(where: str, path: Path, found: Mapping[str, Path], named: 
         alike.append(f"{entry.name}/ looks like {role}, which is read from {ROLES[role][0]}/{meaning}")
         ways.append((role, entry.name))
     if alike:
-        flags = " ".join(f"--folder {role}={name}" for role, name in ways)
+        flags = " ".join(f"--folder {quote(f'{role}={name}')}" for role, name in ways)
         one = len(ways) == 1
         optional = [role for role, _ in ways if role != "depth"]
         out = ""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import shutil
 from pathlib import Path
 
@@ -321,6 +322,8 @@ def test_a_file_that_seems_to_hold_all_poses_is_told_with_where_poses_belong(tmp
     shutil.rmtree(root / "poses")
     (told,) = open_source(root).unread()
     assert told == "poses.json; poses are read from poses/NAME.txt: 4x4 each, world from camera"
+    (root / "poses.json").rename(root / "docker-compose.yaml")
+    assert open_source(root).unread() == ["docker-compose.yaml"]
 
 
 def test_all_folders_that_look_like_a_role_are_told_at_once_and_the_advice_works(tmp_path: Path) -> None:
@@ -336,6 +339,11 @@ def test_all_folders_that_look_like_a_role_are_told_at_once_and_the_advice_works
     assert "--folder pose= --folder color= (in Python 'pose': None, 'color': None)" in text
     assert set(open_source(root, folders={"pose": "cam_poses", "color": "rgb"}).files("1")) >= {"pose", "color"}
     assert not {"pose", "color"} & set(open_source(root, folders={"pose": None, "color": None}).files("1"))
+    (root / "cam_poses").rename(root / "Cam Poses")
+    with pytest.raises(CaptureError) as caught:
+        open_source(root, kind="folder")
+    said = shlex.split(re.search(r"or say (.*?) \(in Python", str(caught.value))[1])
+    assert said == ["--folder", "pose=Cam Poses", "--folder", "color=rgb"]
 
 
 # -- what exists and is not read ---------------------------------------------------------------------------------------
