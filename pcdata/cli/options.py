@@ -18,7 +18,6 @@ _NO_OPTIONS = {  # of opening captures, not of their layout
     "skip": "--skip",
     "skip_refused": "--skip-refused",
 }
-RIG_OPTIONS = ("metres_per_unit", "depth_encoding", "invalid_values", "background_label", "folders", "links_to")
 
 
 def add_capture_options(command: argparse.ArgumentParser, *, can_skip_refused: bool = True) -> None:

@@ -1,7 +1,9 @@
 import functools
+import json
 import math
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -12,10 +14,10 @@ from pcdata.cli import main
 from pcdata.errors import CalibrationError, ConfigError
 from pcdata.geometry import rigid
 from pcdata.geometry.small_motions import motion_from_twist, twist_from_motion
-from pcdata.io import write_calibration
+from pcdata.io import write_calibration, write_ply
 from pcdata.io.calibration.capture_camera import CaptureCamera, write_capture_camera
 from pcdata.io.images.writing import write_depth
-from pcdata.structures import DepthFrame
+from pcdata.structures import DepthFrame, PointCloud
 from pcdata.synthetic import Miscalibration, Tabletop, tabletop
 from tests.scenes import overlapping
 
@@ -235,3 +237,51 @@ def test_the_commands_judge_and_refine_a_rig_on_disk(tmp_path, capsys):
     (tmp_path / "rig" / "top").rename(tmp_path / "rig" / "ceiling")
     assert main(["calib", "overlap", *line]) == 1
     assert "missing: top" in capsys.readouterr().err
+
+
+def test_a_recording_of_several_views_is_judged_and_refined_as_a_rig_is(tmp_path, capsys):
+    pytest.importorskip("pyarrow")
+    write_rig(tmp_path / "rig", rig(0))
+    calibration, recording = str(tmp_path / "old.yaml"), str(tmp_path / "recording")
+    write_calibration(calibration, calibration_of(rig(0)))
+    read = [str(tmp_path / "rig"), "--calibration", calibration, "--frame", "base"]
+    assert main(["convert", *read, "--to", "lerobot", "--out", recording]) == 0
+    assert main(["calib", "overlap", recording, "--json", str(tmp_path / "o.json")]) == 1
+    assert "recalibrate right" in capsys.readouterr().out
+    (stand,) = json.loads((tmp_path / "o.json").read_text())["stands"]
+    pairs = {(pair["first"], pair["second"]) for pair in stand["pairs"]}
+    assert pairs == {("left", "right"), ("left", "top"), ("right", "top")}
+    new = str(tmp_path / "new.yaml")
+    assert main(["calib", "refine", recording, "--calibration", calibration, "--out", new]) == 0
+    assert main(["calib", "overlap", recording, "--calibration", new]) == 0
+
+
+def test_captures_of_a_camera_that_moves_are_judged_stand_by_stand(tmp_path, capsys):
+    right, wrong = rig(0, millimetres=0, degrees=0), rig(0)
+    for sample, frame in (("0001", right), ("0002", wrong), ("0003", right)):
+        for view, name in enumerate(NAMES):
+            camera = tmp_path / "rig" / name
+            for folder in ("depth", "poses"):
+                (camera / folder).mkdir(parents=True, exist_ok=True)
+            write_depth(camera / "depth" / f"{sample}.png", frame.depth[view], metres_per_unit=0.001)
+            np.savetxt(camera / "poses" / f"{sample}.txt", frame.world_from_camera[view].numpy())
+            facts = CaptureCamera(camera=frame.camera.view(view), metres_per_unit=0.001, frame_id="base")
+            write_capture_camera(camera / "intrinsics.json", facts)
+    assert main(["calib", "overlap", str(tmp_path / "rig"), "--json", str(tmp_path / "o.json")]) == 1
+    out = capsys.readouterr().out
+    assert "capture 0001, 0003\noverlap: pass" in out
+    assert "capture 0002\noverlap: fail" in out
+    told = json.loads((tmp_path / "o.json").read_text())
+    assert told["verdict"] == "fail"
+    assert [stand["captures"] for stand in told["stands"]] == [["0001", "0003"], ["0002"]]
+
+
+def test_captures_that_cannot_be_compared_are_told_with_advice(tmp_path, capsys):
+    write_rig(tmp_path / "rig", rig(0))
+    assert main(["calib", "overlap", str(tmp_path / "rig" / "left")]) == 1
+    assert "one folder per camera" in capsys.readouterr().err
+    write_ply(tmp_path / "cloud.ply", PointCloud(points=torch.rand(50, 3), ptr=None, frame_id="base"))
+    assert main(["calib", "overlap", str(tmp_path / "cloud.ply")]) == 1
+    assert "holds clouds; give the depth images" in capsys.readouterr().err
+    assert main(["calib", "refine", str(tmp_path / "rig"), "--out", str(tmp_path / "new.yaml")]) == 2
+    assert "with --calibration FILE" in capsys.readouterr().err

@@ -135,6 +135,10 @@ def _open_one(path: Path, kind: str | None, options: dict[str, Any]) -> Source:
     for option in options:
         if option not in known:
             hint = near_matches(option, [*known, *COMBINATORS])
+            if option == "calibration":
+                hint = (
+                    "; poses of a calibration go around captures of any layout with posed={'file': ...} (--posed FILE)"
+                )
             raise ConfigError(
                 f"{_WHERE}: the layout {layout.kind!r} has no option {option!r}{hint}; it has "
                 f"{', '.join(known) or 'none'}"

@@ -30,10 +30,14 @@ def surfaces_of(
     if isinstance(capture, PointCloud):
         return _of_clouds(where, capture, max_samples)
     if capture.num_views < 2:
-        raise ShapeError(f"{where}: comparing cameras needs two views or more, the capture has {capture.num_views}")
+        raise ShapeError(
+            f"{where}: comparing cameras needs two views or more, the capture has {capture.num_views}; give a frame of "
+            "all cameras, as a folder with one folder per camera is read"
+        )
     if capture.world_from_camera is None:
         raise FrameError(
-            f"{where}: capture {capture.sample_id!r} has no world_from_camera; its views are not related to each other"
+            f"{where}: capture {capture.sample_id!r} has no world_from_camera, so its views are not related to "
+            "each other; give their poses, or a calibration that has them (calibration=, posed=)"
         )
     camera = capture.camera.to(capture.device)
 
