@@ -11,6 +11,7 @@ from pathlib import Path
 from pcdata.build.config import BuildConfig
 from pcdata.build.origins import Origin, origin_of
 from pcdata.build.records import BuiltSample
+from pcdata.contracts.on_host import counts_of
 from pcdata.errors import CacheError, CaptureError, ConfigError, ReplayError, WriteError
 from pcdata.files.inputs import Inputs, recording
 from pcdata.io.sources.capture_source import CaptureSource
@@ -65,6 +66,7 @@ class CaptureWork:
             _counts(cloud, {type(step).__name__: step for step in self.prefix.parts()}),
             time.perf_counter() - started,
             cloud.num_points,
+            min(counts_of(cloud.ptr), default=0),
             record.digest(),
         )
         return Made(capture, record, _one_each(cloud), sample, origin_of(cloud))

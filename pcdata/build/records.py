@@ -27,7 +27,8 @@ class BuiltSample:
     entered_at: str  # "depth", or "cloud" where the capture was one already
     counts: list[tuple[str, int]]  # step name -> points after it, over all clouds of the sample
     seconds: float
-    num_points: int = 0
+    num_points: int = 0  # over all clouds
+    fewest_points: int = 0  # of one cloud: steps take each by itself
     digest: str = ""  # of its record
 
 

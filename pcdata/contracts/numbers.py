@@ -19,6 +19,8 @@ from torch import Tensor
 from pcdata.contracts.on_host import bounds_of, on_host, uploaded
 from pcdata.errors import ConfigError, DTypeError, ShapeError, TooFewPointsError, near_matches
 
+_SHORTEST = 1e-15
+
 # Returns ``arguments[name]`` as bodies get it; tensors, row pointers among them, are checked already. ``where`` is the
 # operation, which its errors name.
 Spec = Callable[[str, str, Mapping[str, Any]], Any]
@@ -192,8 +194,13 @@ def whole_number(where: str, name: str, value: Any) -> int:
 
 
 def require_length(where: str, name: str, value: float) -> None:
-    """Require a positive, finite length whose square is still positive in float32 (about 1e-22 or more)."""
+    """Require a positive, finite length whose square keeps all its digits in float32.
+
+    Squares below about 1e-38 lose digits, or are 0 where torch flushes them: a thousandth of 1e-15 is far from that.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise DTypeError(f"{where}: {name} must be a number in the unit of the points, not {type(value).__name__}")
-    if not math.isfinite(value) or not 1e-22 <= value <= 1e19:
-        raise ConfigError(f"{where}: {name} must be a length in the unit of the points, 1e-22 to 1e19, got {value}")
+    if not math.isfinite(value) or not _SHORTEST <= value <= 1e19:
+        raise ConfigError(
+            f"{where}: {name} must be a length in the unit of the points, {_SHORTEST:g} to 1e19, got {value}"
+        )

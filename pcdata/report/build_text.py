@@ -62,7 +62,10 @@ def _too_few_points(config: BuildConfig, report: BuildReport) -> str | None:
             break  # those behind it get as many as it fills up to
         if isinstance(wanted, int) and getattr(step, "if_short", None) == "error" and not hasattr(step, "spread"):
             short = [
-                f"{sample.id!r} ({sample.num_points:,})" for sample in report.samples if sample.num_points < wanted
+                f"{sample.id!r} ({'' if sample.fewest_points == sample.num_points else 'a cloud of '}"
+                f"{sample.fewest_points:,})"
+                for sample in report.samples
+                if sample.fewest_points < wanted
             ]
             if short:
                 way = "leave them out with --skip ID" + ("" if config.model else f", or choose if_short of {name}")

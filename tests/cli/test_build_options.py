@@ -84,6 +84,22 @@ def test_samples_that_training_will_refuse_are_told(capsys, config, captures, tm
     assert "will be refused" not in out
 
 
+def test_training_refuses_a_sample_by_its_smallest_cloud(capsys, tmp_path):
+    frame = tabletop_frame(2)
+    fewest = int((frame.depth[1, :30] > 0).sum())
+    frame.depth[1, 30:] = 0
+    write_capture(frame, tmp_path / "rig")
+    config = tmp_path / "views.yaml"
+    steps = "depth: [Deproject: {}]\ncloud: [ToFrame: {frame: base}]\n"
+    config.write_text(f"{steps}augment: [RandomSample: {{num_points: {fewest + 1}}}]\n")
+    code, out, err = run(capsys, "build", config, "--source", tmp_path / "rig", "--out", tmp_path / "set")
+    assert code == 0, err
+    with pytest.raises(TooFewPointsError):
+        CachedCloudDataset(tmp_path / "set", seed=0)[0]
+    assert f"1 sample will be refused when read, having fewer than the {fewest + 1:,} points" in out
+    assert f"(a cloud of {fewest:,})" in out
+
+
 def test_set_changes_settings_with_their_types(capsys, config, captures, tmp_path):
     words = [
         "cloud.FarthestPointSample.num_points=8",
