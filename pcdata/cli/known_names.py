@@ -105,6 +105,7 @@ CHOICES = (
 _BUFFER = (
     "state",
     "action",
+    "poses",
     "next_state",
     "episodes",
     "arrays",
@@ -143,7 +144,18 @@ TARGETS: dict[str, tuple[str, ...]] = {
 WRITERS: dict[str, tuple[str, ...]] = {
     "folder": (),
     "mcap": ("color", "quality", "compression", "fps"),
-    "lerobot": ("depth", "metres_per_unit", "color", "fps", "state", "action", "points", "registered_to", "robot_type"),
+    "lerobot": (
+        "depth",
+        "metres_per_unit",
+        "color",
+        "fps",
+        "state",
+        "action",
+        "poses",
+        "points",
+        "registered_to",
+        "robot_type",
+    ),
 }  # with their options
 SENSORS = (
     "realsense_d415",

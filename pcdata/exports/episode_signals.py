@@ -11,15 +11,19 @@ from torch import Tensor
 
 from pcdata.errors import CaptureError, near_matches
 from pcdata.structures import DepthFrame, PointCloud
+from pcdata.structures.signal_kinds import poses_in_a_row
 from pcdata.structures.signals import Signal, cloud_from_frame, is_frame_of_camera
 
 _STILL = 1e-6  # metres and parts of a rotation by which the poses of a camera that stands still may differ
 
 
 def signal_row(
-    where: str, cloud: PointCloud | DepthFrame, what: str, names: str, *, free: bool = False
+    where: str, cloud: PointCloud | DepthFrame, what: str, names: str, *, poses: str = "", free: bool = False
 ) -> NDArray[np.float32]:
     """Return signals of one cloud or capture side by side, as float32 (D,); with ``free`` one signal of any shape.
+
+    Poses are written in the layout ``poses``; "" = as they were recorded, matrices as :data:`USUAL_ROW`. With ``free``
+    the signal stays as it is.
 
     Raises:
         CaptureError: there is no such signal, or one that is no row of numbers.
@@ -32,12 +36,17 @@ def signal_row(
                 f"{where}: {what} is the signal {name!r}, which is not there{near_matches(name, signals)}; the "
                 f"signals are: {known}; attach it to the captures (with_signal), or say {what}=NAME,NAME"
             )
-        parts.append(_numbers(where, what, name, signals[name], free=free))
+        values: Any = signals[name]
+        if not free:
+            values = _in_a_row(cloud.recorded_signals[name].kind, values, poses)
+        parts.append(_numbers(where, what, name, values, free=free))
     return np.concatenate(parts)
 
 
-def next_row(where: str, cloud: PointCloud, following: PointCloud, names: str) -> NDArray[np.float32]:
-    """Return the signals of the following cloud in the coordinates of this one, side by side.
+def next_row(
+    where: str, cloud: PointCloud, following: PointCloud, names: str, *, poses: str = ""
+) -> NDArray[np.float32]:
+    """Return the signals of the following cloud in the coordinates of this one, side by side, as :func:`signal_row`.
 
     Raises:
         CaptureError: this cloud does not know the frame that one was recorded in.
@@ -58,8 +67,12 @@ def next_row(where: str, cloud: PointCloud, following: PointCloud, names: str) -
                     "a frame that stands still"
                 )
             values = signal.moved(cloud_from_frame(cloud, signal.frame))
-        parts.append(_numbers(where, "state", name, values, free=False))
+        parts.append(_numbers(where, "state", name, _in_a_row(signal.kind, values, poses), free=False))
     return np.concatenate(parts)
+
+
+def _in_a_row(kind: str, values: Any, poses: str) -> Any:
+    return poses_in_a_row(kind, values, poses)[1] if isinstance(values, Tensor) else values
 
 
 def _stays(cloud: PointCloud, following: PointCloud) -> bool:
@@ -73,7 +86,7 @@ def _numbers(where: str, what: str, name: str, values: Any, *, free: bool) -> ND
         found = "a text" if not isinstance(values, Tensor) else f"of shape {tuple(values.shape[1:])}"
         raise CaptureError(
             f"{where}: {what} must be a row of numbers, but the signal {name!r} is {found}; choose another, or record "
-            "it in a row: a pose as xyz_quat_xyzw, xyz_rot6d_rows, ... (docs/signals.md)"
+            f"it in a row. If it is a 4x4 pose, state that when it is read: --signal {name}='pose matrix in FRAME'"
         )
     row = values[0].to("cpu", torch.float64)
     narrow: NDArray[np.float32] = np.atleast_1d(row.numpy()).astype(np.float32)

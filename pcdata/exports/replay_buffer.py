@@ -28,9 +28,11 @@ from pcdata.exports.registry import register_target
 from pcdata.exports.sample_needs import check_channels, check_same_count, one_cloud
 from pcdata.exports.target import CloudArray, Item, Note, Samples, Target
 from pcdata.exports.zarr_v2 import Compression, RowWriter, write_group
+from pcdata.files.sample_names import counted
 from pcdata.io.store.sample_keys import key_of
 from pcdata.models import contract
 from pcdata.structures import DepthFrame, Episode, PointCloud
+from pcdata.structures.signal_kinds import checked_pose_layout
 
 _CHUNK = 100  # timesteps, as the original converters have it
 # The loaders ask for img, of any size, read all of it into memory and use none of it: one pixel per timestep will do.
@@ -50,6 +52,8 @@ class _ReplayBuffer(Target):
     Args:
         state: the signals that make the state, side by side, with commas between them.
         action: the signals that make the action.
+        poses: how poses are written in states and actions: xyz_rot6d_rows, xyz_quat_xyzw or another layout of a row
+            (docs/signals.md); "" = as they were recorded, and those that are 4x4 as xyz_rot6d_rows.
         next_state: the action of a step is the state of the next one, in the coordinates of the step; the last step of
             every episode has none and is left out.
         episodes: states, actions and which samples make an episode, of clouds that have no signals; see
@@ -73,6 +77,7 @@ class _ReplayBuffer(Target):
 
     state: str = "state"
     action: str = "action"
+    poses: str = ""
     next_state: bool = False
     episodes: Given | None = None
     arrays: str = ""
@@ -125,6 +130,10 @@ class _ReplayBuffer(Target):
 
     def plan(self, ids: Sequence[str], episodes: Sequence[Episode], left_out: Collection[str]) -> list[Item]:
         """Whole episodes alone: one with a step that does not fit is left out, since nothing goes on across a gap."""
+        if self.poses:
+            checked_pose_layout(f"{self.name}: poses", self.poses)
+            if self.episodes is not None:
+                raise ConfigError(f"{self.name}: poses is for signals; the files of episodes are written as they are")
         known = self.channels and set(ids)
         further = self.further
         if self.episodes is None:
@@ -189,10 +198,10 @@ class _ReplayBuffer(Target):
         check_same_count(where, cloud, seen.get("count", cloud.num_points))
         rows: Rows = {"point_cloud": points}
         if self.episodes is None:
-            state = signal_row(where, cloud, "state", self.state)
+            state = signal_row(where, cloud, "state", self.state, poses=self.poses)
             rows.update(dict.fromkeys(self.state_arrays, state))
             if not self.next_state:
-                rows["action"] = signal_row(where, cloud, "action", self.action)
+                rows["action"] = signal_row(where, cloud, "action", self.action, poses=self.poses)
             for name in self.further:
                 rows[name] = signal_row(where, cloud, name, name, free=True)
             for name, row in rows.items():
@@ -228,8 +237,8 @@ class _ReplayBuffer(Target):
         short = [one.id for one, length in zip(item.episodes, lengths) if length < shortest]
         if short:
             note(
-                f"{len(short)} episodes have fewer than {shortest} steps (first: {short[0]!r}): the loader cuts no "
-                f"sequence from them with its horizon of {horizon}, {observed} observed and {acted} acted steps"
+                f"{counted(len(short), 'episode')} of fewer than {shortest} steps (first: {short[0]!r}): the loader "
+                f"cuts no sequence from such with its horizon of {horizon}, {observed} observed and {acted} acted steps"
             )
         if self.scales and (warning := ranges.warning(self.name)) is not None:
             note(warning)
@@ -247,7 +256,7 @@ class _ReplayBuffer(Target):
             if before is not None:
                 name, former, former_rows = before
                 where = f"{self.name}: sample {name!r}"
-                former_rows["action"] = next_row(where, former, cloud, self.state)
+                former_rows["action"] = next_row(where, former, cloud, self.state, poses=self.poses)
                 yield name, former_rows
             before = None if number in last else (sample_id, cloud, rows)
 

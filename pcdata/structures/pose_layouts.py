@@ -101,6 +101,7 @@ class PoseLayout:
     row: tuple[int, ...]  # shape of one pose
     holds: str  # in words
     rotation: Callable[[Tensor], Tensor]  # rotation part -> R (..., 3, 3), float64
+    written: Callable[[Tensor], Tensor]  # R (..., 3, 3) float64 -> rotation part
     turned: Callable[[Tensor, Tensor, Callable[[], Tensor]], Tensor]  # rotation part, Q, its quaternion (..., 4) -> Q R
     conjugated: Callable[[Tensor, Tensor, Tensor], Tensor]  # rotation part, Q, handedness (..., 1) -> Q R Q^T
     faults: Callable[[Tensor], list[Fault]]  # of rotation parts; of poses that are 4x4, of those
@@ -145,7 +146,7 @@ def _by_matrix(rotation: Callable[[Tensor], Tensor], written: Callable[[Tensor],
     def conjugated(part: Tensor, matrix: Tensor, handedness: Tensor) -> Tensor:
         return written(_product(_product(matrix, rotation(part)), matrix.mT))
 
-    return {"rotation": rotation, "turned": turned, "conjugated": conjugated}
+    return {"rotation": rotation, "written": written, "turned": turned, "conjugated": conjugated}
 
 
 def _quaternion(w_last: bool) -> Ways:
@@ -174,7 +175,11 @@ def _quaternion(w_last: bool) -> Ways:
             ),
         ]
 
-    return {"rotation": rotation_of, "turned": turned, "conjugated": conjugated, "faults": faults}
+    def written(rotation: Tensor) -> Tensor:
+        quaternion = rotations.quaternion_from_rotation(rotation)
+        return quaternion.roll(-1, -1) if w_last else quaternion
+
+    return {"rotation": rotation_of, "written": written, "turned": turned, "conjugated": conjugated, "faults": faults}
 
 
 def _two_vectors(rows: bool) -> Ways:
@@ -220,7 +225,10 @@ def _rotation_vector() -> Ways:
     def conjugated(part: Tensor, rotation: Tensor, handedness: Tensor) -> Tensor:
         return handedness * applied(rotation, part)
 
-    return {"rotation": matrix, "turned": turned, "conjugated": conjugated, "faults": _no_faults}
+    def written(rotation: Tensor) -> Tensor:
+        return rotations.rotation_vector_from_quaternion(rotations.quaternion_from_rotation(rotation))
+
+    return {"rotation": matrix, "written": written, "turned": turned, "conjugated": conjugated, "faults": _no_faults}
 
 
 def _no_faults(part: Tensor) -> list[Fault]:

@@ -7,7 +7,7 @@ its coordinates came about, and gives them in its own when they are read. So no 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -16,7 +16,13 @@ from torch import Tensor
 from pcdata.errors import DeviceError, DTypeError, FrameError, NonFiniteError, PoseError, ShapeError
 from pcdata.structures.kinds import CAMERA_FRAME
 from pcdata.structures.pose_layouts import motion_by
-from pcdata.structures.signal_kinds import moved_values, parse_kind, pose_faults
+from pcdata.structures.signal_kinds import (
+    checked_pose_layout,
+    moved_values,
+    parse_kind,
+    pose_faults,
+    poses_rewritten,
+)
 from pcdata.structures.structure import Structure, derived
 
 if TYPE_CHECKING:
@@ -101,6 +107,21 @@ class Signal(Structure):
             return self.values
         _check_motion("Signal.moved", matrix, len(self))
         return _moved(f"Signal.moved: a {self.kind!r}", self, motion_by(matrix.to(device=self.values.device)))
+
+    def with_poses_as(self, layout: str) -> Signal:
+        """Return the same poses written in another layout of a row, such as ``"xyz_rot6d_rows"``; the dtype stays.
+
+        A rotation alone becomes the rotation part of the layout. What is no pose, and a pose in this layout already,
+        keeps its bits. A quaternion comes out with w >= 0, so it may jump between steps; six numbers of R never do.
+
+        Raises:
+            ConfigError: there is no such layout of a row.
+        """
+        checked_pose_layout("Signal.with_poses_as", layout)
+        if isinstance(self.values, tuple):
+            return self
+        kind, values = poses_rewritten(self.kind, self.values, layout)
+        return replace(self, kind=kind, values=values)
 
     def same_bits(self, other: Signal) -> bool:
         """Whether the other is of the same kind, frame, dtype and shape, and all its values are the same."""

@@ -148,9 +148,9 @@ def test_episodes_too_short_for_a_sequence_are_noted(tmp_path):
         starts = range(-1, length - 16 + 7 + 1)  # create_indices: min_start .. max_start
         assert len(starts) == sequences
         report = export_dataset(clouds(length), "dp3", tmp_path / str(length), episodes=episodes((length,)))
-        assert [("1 episodes have fewer than 8 steps (first: 'episode0')" in note) for note in report.notes] == [
-            True
-        ] * (not sequences)
+        assert [("1 episode of fewer than 8 steps (first: 'episode0')" in note) for note in report.notes] == [True] * (
+            not sequences
+        )
 
 
 def test_a_frame_can_be_asked_for(tmp_path):

@@ -289,3 +289,39 @@ def test_signals_follow_the_cloud_into_another_frame(tmp_path):
     data, _ = read(tmp_path / "out", ["state", "action", "point_cloud"])
     assert np.allclose(data["state"] + data["action"], data["point_cloud"][:, 0, :3], atol=1e-6)
     assert np.allclose(data["state"][1], [0.5 - 0.2, 0.1, 0.3])
+
+
+def posed_step(number: int) -> PointCloud:
+    """A cloud with the pose of a gripper as a 4x4, and its width."""
+    angle = 0.4 * number
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:2, :2] = torch.tensor([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    pose[:3, 3] = torch.tensor([0.1 * number, 0.2, 0.3])
+    made = cloud(512, seed=number).with_signal("eef", pose[None], "pose matrix", "base")
+    return made.with_signal("width", torch.tensor([[0.08]]), "invariant")
+
+
+@pytest.mark.parametrize(
+    ("poses", "rotation"),
+    [
+        ("", lambda c, s: [c, -s, 0, s, c, 0]),
+        ("xyz_rot6d_columns", lambda c, s: [c, s, 0, -s, c, 0]),
+        ("xyz_axis_angle", lambda c, s: [0, 0, np.arctan2(s, c)]),
+    ],
+)
+def test_poses_that_are_4x4_become_position_and_rotation(poses: str, rotation: Any, tmp_path: Path) -> None:
+    out = tmp_path / "dp3.zarr"
+    source = Recording((12,), posed_step)
+    export_dataset(source, "dp3", out, state="eef,width", next_state=True, poses=poses)
+    data, _ = read(out, ["state", "action"])
+    wanted = [
+        [0.1 * n, 0.2, 0.3, *rotation(np.cos(0.4 * n), np.sin(0.4 * n)), 0.08] for n in range(7)
+    ]  # less than half a turn
+    np.testing.assert_allclose(data["state"][:7], wanted, atol=1e-6)
+    np.testing.assert_allclose(data["action"][:6], wanted[1:], atol=1e-6)
+
+
+def test_a_wrong_layout_of_poses_is_refused_before_anything_is_written(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="dp3: poses: a pose is written in a row as one of"):
+        export_dataset(Recording((12,), posed_step), "dp3", tmp_path / "a", state="eef", action="eef", poses="rot6d")
+    assert not (tmp_path / "a").exists()

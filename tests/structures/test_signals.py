@@ -25,7 +25,7 @@ from pcdata.io.store.cloud_record import (
 from pcdata.io.store.shards import SIGNALS_KEY
 from pcdata.io.store.stores import STORES
 from pcdata.structures.pose_layouts import LAYOUTS
-from pcdata.structures.signal_kinds import SIGNAL_KINDS, parse_kind, signal_kinds_table
+from pcdata.structures.signal_kinds import SIGNAL_KINDS, parse_kind, poses_of_signal, signal_kinds_table
 from pcdata.transforms import RandomRotation
 from tests.factories import assert_same, base_from_camera, cloud_in_base, cloud_in_camera
 from tests.signals import EULER, has_position, markers, read, with_signals
@@ -526,3 +526,33 @@ def test_a_matrix_that_moves_nothing_is_refused():
     for matrix in (torch.diag(torch.tensor([0.0, 1, 1, 1])), torch.full((4, 4), torch.nan)):
         with pytest.raises(errors.PoseError, match="invertible"):
             force.moved(matrix[None])
+
+
+@pytest.mark.parametrize("name", [name for name, layout in LAYOUTS.items() if layout.has_position])
+@pytest.mark.parametrize("other", ["xyz_rot6d_rows", "xyz_quat_xyzw", "xyz_axis_angle", "xyz_euler_xyz_fixed"])
+def test_poses_written_in_another_layout_are_the_same_poses(name, other):
+    angles = torch.tensor([[0.3, -0.2, 2.9], [-1.0, 0.4, 0.1], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    matrix = torch.eye(4, dtype=torch.float64).repeat(3, 1, 1)
+    matrix[:, :3, :3] = torch.from_numpy(Rotation.from_euler("xyz", angles.numpy()).as_matrix())
+    matrix[:, :3, 3] = angles * 0.1
+    six = torch.cat([matrix[:, :3, 3], matrix[:, 0, :3], matrix[:, 1, :3]], dim=1)
+    given = Signal(six, "pose xyz_rot6d_rows", "base")
+    given = Signal(matrix, "pose matrix", "base") if name == "matrix" else given.with_poses_as(name)
+    found = given.with_poses_as(other)
+    assert (found.kind, found.frame, found.values.dtype) == (f"pose {other}", "base", torch.float64)
+    torch.testing.assert_close(poses_of_signal(found.kind, found.values), matrix, rtol=0, atol=1e-12)
+    assert found.with_poses_as(other).same_bits(found)
+
+
+def test_rewritten_poses_leave_the_columns_beside_them_and_rotations_stay_alone():
+    pose = torch.tensor([[0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0, 0.7]])
+    both = Signal(pose, "pose xyz_quat_xyzw + invariant 1", "base").with_poses_as("xyz_rot6d_rows")
+    assert both.kind == "pose xyz_rot6d_rows + invariant 1"
+    assert both.values.tolist() == [pytest.approx([0.1, 0.2, 0.3, 1, 0, 0, 0, 1, 0, 0.7])]
+    turned = Signal(torch.eye(3)[None], "pose rotation", "base").with_poses_as("xyz_quat_wxyz")
+    assert (turned.kind, turned.values.tolist()) == ("pose quat_wxyz", [[1, 0, 0, 0]])
+    joints = Signal(torch.rand(1, 7), "invariant")
+    assert joints.with_poses_as("xyz_rot6d_rows").same_bits(joints)
+    for wrong in ("matrix", "quat_xyzw", "xyz_rot6d"):
+        with pytest.raises(errors.ConfigError, match="written in a row as one of xyz_quat_wxyz"):
+            joints.with_poses_as(wrong)

@@ -15,6 +15,7 @@ from pcdata.errors import CaptureError, ConfigError, near_matches
 from pcdata.io.sources.lerobot_facts import DTYPES, IMAGES, SignalFacts
 from pcdata.io.sources.lerobot_files import INDEX_COLUMNS
 from pcdata.structures import DepthFrame, Signal
+from pcdata.structures.signal_kinds import poses_in_a_row
 
 _TASKS = ("task", "instruction", "language_instruction", "language")
 _INDEX_DTYPES = {"timestamp": "float32"}
@@ -139,9 +140,9 @@ def named_signals(where: str, option: str, names: Any) -> list[str]:
 
 
 def derived_columns(
-    where: str, option: str, column: str, names: Sequence[str], facts: Mapping[str, SignalFacts]
+    where: str, option: str, column: str, names: Sequence[str], facts: Mapping[str, SignalFacts], poses: str = ""
 ) -> dict[str, Any] | None:
-    """Return the feature that repeats several signals in one row of numbers, as policies take them.
+    """Return the feature that repeats several signals in one row of numbers, as policies take them; poses as stated.
 
     Raises:
         ConfigError: one is not there, is a text, or there is such a column already.
@@ -155,14 +156,16 @@ def derived_columns(
         if name not in facts or facts[name].dtype is None:
             hint = near_matches(name, facts) or f"; there are {', '.join(facts) or 'none'}"
             raise ConfigError(f"{where}: {option}: there is no signal of numbers {name!r:.100}{hint}")
-        width += int(np.prod(facts[name].shape, dtype=np.int64))
+        like = torch.zeros(1, *facts[name].shape, dtype=torch.float32, device="cpu")
+        width += poses_in_a_row(facts[name].kind, like, poses)[1].numel()
     return _feature("float32", [width])
 
 
-def derived_value(names: Sequence[str], signals: Mapping[str, Signal]) -> NDArray[np.float32]:
-    """Return several signals in one row of numbers."""
-    parts = [signals[name].values for name in names]
-    return torch.cat([part.reshape(-1).float() for part in parts if isinstance(part, Tensor)]).numpy()
+def derived_value(names: Sequence[str], signals: Mapping[str, Signal], poses: str = "") -> NDArray[np.float32]:
+    """Return several signals in one row of numbers, their poses written as stated."""
+    parts = [(signals[name].kind, signals[name].values) for name in names]
+    rows = [poses_in_a_row(kind, values, poses)[1] for kind, values in parts if isinstance(values, Tensor)]
+    return torch.cat([row.reshape(-1).float() for row in rows]).numpy()
 
 
 def number_feature(dtype: str, shape: Sequence[int], names: Sequence[str] | None = None) -> dict[str, Any]:

@@ -68,7 +68,7 @@ class GrowingDataset:
         self._features: dict[str, dict[str, Any]] = signal_features(self._signals)
         for option, column, given in (("state", _STATE, options.state), ("action", _ACTION, options.action)):
             names = named_signals("lerobot", option, given)
-            feature = derived_columns("lerobot", option, column, names, self._signals)
+            feature = derived_columns("lerobot", option, column, names, self._signals, options.poses)
             if feature is not None:
                 self._features[column] = feature
                 self._derived[column] = names
@@ -156,7 +156,7 @@ class GrowingDataset:
             if one.column is not None:
                 row[one.column] = signal_value(one, frame.recorded_signals[name])
         for column, names in self._derived.items():
-            row[column] = derived_value(names, frame.recorded_signals)
+            row[column] = derived_value(names, frame.recorded_signals, self._options.poses)
         lost = [camera.add(row, frame) for camera in self._cameras]
         off, beyond = max(metres for metres, _ in lost), sum(values for _, values in lost)
         if off or beyond:

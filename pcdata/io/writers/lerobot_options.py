@@ -10,6 +10,7 @@ from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import ConfigError
 from pcdata.io.writers.lerobot_camera_files import ColorStorage, DepthStorage
 from pcdata.io.writers.writer import Writer
+from pcdata.structures.signal_kinds import checked_pose_layout
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,6 +26,8 @@ class LeRobotOptions(Writer):
         fps: steps in a second; None = of the times of the episodes, 10 where there are none.
         state: signals that ``observation.state`` repeats in one row, as policies take them.
         action: the same of ``action``, where no signal is called so.
+        poses: how ``state`` and ``action`` write poses: xyz_rot6d_rows, xyz_quat_xyzw or another layout of a row
+            (docs/signals.md); "" = as they were recorded, and those that are 4x4 as xyz_rot6d_rows.
         points: rows of ``observation.pointcloud``, the capture's points in the frame of its poses; 0 = none.
         registered_to: what to say of whose pixels depth has; None = of color, where captures have that.
         robot_type: the name of the robot.
@@ -36,6 +39,7 @@ class LeRobotOptions(Writer):
     fps: float | None = None
     state: Sequence[str] | str = ()
     action: Sequence[str] | str = ()
+    poses: str = ""
     points: int = 0
     registered_to: str | None = None
     robot_type: str | None = None
@@ -54,6 +58,8 @@ class LeRobotOptions(Writer):
         fps: Any = self.fps
         if fps is not None and not (isinstance(fps, (int, float)) and 1 <= fps <= 1000):
             raise ConfigError(f"lerobot: fps must be steps in a second, 1 to 1000, got {fps!r:.60}")
+        if self.poses != "":
+            checked_pose_layout("lerobot: poses", self.poses)
         points: Any = self.points
         if isinstance(points, bool) or not isinstance(points, int) or not 0 <= points < 1 << 24:
             raise ConfigError(f"lerobot: points must be a whole number from 0, got {points!r:.60}")

@@ -343,6 +343,21 @@ def test_signals_of_a_row_are_named_as_exports_name_them(tmp_path: Path) -> None
         convert(made, "lerobot", tmp_path / "bad", state="joints,,count")
 
 
+def test_poses_in_the_state_are_position_and_rotation_in_the_layout_asked_for(tmp_path: Path) -> None:
+    pose = torch.eye(4, dtype=torch.float64)
+    pose[:3] = torch.tensor([[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3]])
+    frames = {"0": made_frame().with_signal("hand", pose[None], "pose matrix", "base")}
+    rows = {"": [0, -1, 0, 1, 0, 0], "xyz_quat_xyzw": [0, 0, 0.5**0.5, 0.5**0.5]}
+    for number, (poses, rotation) in enumerate(rows.items()):
+        out = tmp_path / str(number)
+        convert(MadeCaptures(frames), "lerobot", out, state="hand", poses=poses)
+        (row,) = parquet.read_table(out / ROWS).column("observation.state").to_pylist()
+        assert row == pytest.approx([0.1, 0.2, 0.3, *rotation])
+        assert info(out)["features"]["observation.state"]["shape"] == [len(row)]
+    with pytest.raises(ConfigError, match="lerobot: poses: a pose is written in a row as one of"):
+        convert(MadeCaptures(frames), "lerobot", tmp_path / "bad", state="hand", poses="matrix")
+
+
 def test_one_row_of_large_arrays_is_read_without_decoding_hundreds(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
     rows = lerobot_tables.RowsWriter(tmp_path, {"depth": {"dtype": "float32", "shape": [240, 320]}})
