@@ -193,6 +193,9 @@ def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     yield "sorted_rows", "two", lambda: ((cloud, ptr), {})
     yield "density_clusters", "two", lambda: ((cloud, ptr, 0.03, 4, None), {})
     yield "farthest_rows", "two", lambda: ((cloud, ptr, [20, 7]), {})
+    some = torch.arange(len(cloud)) % 3 != 1
+    kept_ptr = torch.cat([ptr[:1], some.cumsum(0)[ptr[1:] - 1]])
+    yield "farthest_rows_within", "two", lambda: ((cloud, kept_ptr, some, [11, 4]), {})
     yield "voxel_means", "two", lambda: ((cloud, ptr, 0.04 * torch.ones(2, 1, dtype=torch.float64), None), {})
     values = torch.rand(126, generator=seeded(4), dtype=torch.float64)
     yield "window_medians", "two", lambda: ((values, cloud, ptr, None), {})

@@ -44,6 +44,20 @@ def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int], *, backend: st
     return picked
 
 
+@inner
+def farthest_rows_within(
+    points: Tensor,  # (N, 3) float32, all finite
+    ptr: Tensor,  # (B+1,) of the rows within
+    within: Tensor,  # (N,) bool
+    counts: list[int],
+    *,
+    backend: str = "auto",
+) -> tuple[Tensor, Tensor]:  # (M,) int64 rows of points, and the same rows counted among those within
+    """Pick rows as :func:`farthest_rows` does, where the points ``within`` are all that there are."""
+    place = farthest_rows(points[within], ptr, counts, backend=backend)
+    return within.nonzero().squeeze(1)[place], place
+
+
 def checked_ratio(where: str, name: str, arguments: Mapping[str, Any]) -> list[int]:
     """Require a number above 0 and at most 1; bodies get the counts, ceil(ratio * n) in float32 as torch-cluster."""
     ratio = torch.tensor(checked_fraction(where, name, arguments), dtype=torch.float32, device="cpu")

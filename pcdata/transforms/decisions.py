@@ -25,7 +25,12 @@ PER_VIEW = "per_view"  # key of what differs between the views that were merged
 PER_ROW = ("index", "ptr", "per_point", *FIELDS)  # params of rows, not of clouds
 TOLD_ROWS = "rows"  # param (B,) int64: what tells which rows were decided about, where the step has found it out
 LISTS = ("cuts", "joins", "areas")  # params with a row for each thing found, which begins with the number of its cloud
-DERIVED = ("corners", "rms")  # params that follow from others and the data: a history does not tell them
+DERIVED = (
+    "corners",
+    "rms",
+    "place",
+    "place_ptr",
+)  # params that follow from others and the data: a history does not tell them
 _LEAVE_OUT = "leave it out of the chain that is replayed, or run it on these data anew"
 
 

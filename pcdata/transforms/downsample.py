@@ -17,7 +17,7 @@ from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
 from pcdata.functional.fixed_rows import FixedRows
 from pcdata.functional.noise import random_order, random_with_repeats
 from pcdata.functional.rows import cloud_of_rows, group_first, ptr_after_mask, ptr_from_counts
-from pcdata.functional.sampling import farthest_point_sample, random_sample_index
+from pcdata.functional.sampling import farthest_point_sample, farthest_rows_within, random_sample_index
 from pcdata.functional.voxels import find_voxel_size, voxel_downsample, voxel_nearest
 from pcdata.rng import Streams
 from pcdata.sensors import SensorProfile
@@ -36,7 +36,7 @@ from pcdata.transforms.field_types import (
     Unit,
     Vec3,
 )
-from pcdata.transforms.row_sums import sums_when_read
+from pcdata.transforms.row_sums import row_sums, sums_when_read
 
 _FEW_ROWS = 1 << 14  # which a history may hold until somebody reads it
 
@@ -136,19 +136,25 @@ class _Sample(SelectTransform, abstract=True):
     def pick(self, cloud: PointCloud, streams: Streams) -> tuple[Tensor, Tensor]:
         """Sample, then fill up short clouds as ``if_short`` says; -1 marks a zero row."""
         wanted = self.wanted_counts(cloud, streams)
-        available = counts_of(cloud.ptr)
+        counts = self._counts(cloud, wanted, counts_of(cloud.ptr))
+        seeds = streams.seeds().tolist() if self.is_random else [0] * cloud.num_clouds
+        return self._filled(self.sample(cloud, counts, seeds), counts, wanted, seeds)
+
+    def _counts(self, cloud: PointCloud, wanted: list[int], available: list[int]) -> list[int]:
+        """Return how many of the wanted rows each cloud has; refuse a short one if that is asked."""
         for b, (want, have) in enumerate(zip(wanted, available, strict=True)):
             if have < want and (self.if_short == "error" or (have == 0 and self.if_short != "keep")):
                 raise TooFewPointsError(
                     f"{type(self).__name__}: cloud {b}{sample_name(cloud, b)} has {have} points, fewer than the "
                     f"{want} asked; ask for fewer (num_points)" + ("" if have == 0 else ", or choose if_short")
                 )
-        seeds = streams.seeds().tolist() if self.is_random else [0] * cloud.num_clouds
-        counts = [min(pair) for pair in zip(wanted, available, strict=True)]
-        rows = self.sample(cloud, counts, seeds)
+        return [min(pair) for pair in zip(wanted, available)]
+
+    def _filled(self, rows: Tensor, counts: list[int], wanted: list[int], seeds: list[int]) -> tuple[Tensor, Tensor]:
+        """Return as many rows as are wanted, and where each cloud begins among them."""
         if counts == wanted or self.if_short == "keep":
-            return rows, ptr_from_counts(counts, device=cloud.device)
-        return self._fill_up(rows, counts, wanted, seeds), ptr_from_counts(wanted, device=cloud.device)
+            return rows, ptr_from_counts(counts, device=rows.device)
+        return self._fill_up(rows, counts, wanted, seeds), ptr_from_counts(wanted, device=rows.device)
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Select the rows and blank those marked -1."""
@@ -162,10 +168,13 @@ class _Sample(SelectTransform, abstract=True):
 
     def told_rows(self, data: PointCloud, params: Params) -> Sequence[int] | None:
         """Leave it to who reads the history to look at a few rows."""
-        index = params["index"]
-        if self.decides_by != "rows" or index.shape[0] > _FEW_ROWS or not index.is_cpu:
+        if self.decides_by != "rows":
             return super().told_rows(data, params)
-        return sums_when_read(index, params["ptr"], data.ptr)
+        # Among rows that lie between others, their place without these tells which they are.
+        index, ptr = params.get("place", params["index"]), params.get("place_ptr", data.ptr)
+        if index.shape[0] > _FEW_ROWS or not index.is_cpu:
+            return row_sums({"index": index, "ptr": params["ptr"]}, ptr)
+        return sums_when_read(index, params["ptr"], ptr)
 
     def _fill_up(self, rows: Tensor, counts: list[int], wanted: list[int], seeds: list[int]) -> Tensor:
         """Lengthen the ``counts`` rows of every cloud to as many as are wanted."""
@@ -234,6 +243,18 @@ class FarthestPointSample(_FarthestPoints):
     """
 
     start: Annotated[int, Ge(0)] = 0
+
+    def decides_within(self, share: float) -> bool:
+        """Where points alone count, and the first comes first."""
+        return not (self.color_weight or self.balance_labels or self.start)
+
+    def params_within(self, data: PointCloud, within: Tensor, ptr: Tensor) -> Params:
+        """Sample among some rows."""
+        wanted, no_seeds = [self.num_points] * data.num_clouds, [0] * data.num_clouds
+        counts = self._counts(data, wanted, counts_of(ptr))
+        found = farthest_rows_within(data.points.detach(), ptr, within, counts)
+        (index, picked_ptr), (place, _) = (self._filled(rows, counts, wanted, no_seeds) for rows in found)
+        return {"index": index, "ptr": picked_ptr, "place": place, "place_ptr": ptr}
 
     def fixed_work(self, like: FixedRows) -> Callable[[FixedRows], FixedRows] | None:
         """Sample by place alone, from the first row; a cloud that has too few is left to others."""

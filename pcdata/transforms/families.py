@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Collection
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -45,11 +45,16 @@ class SpatialTransform(Transform, abstract=True):
 class SelectTransform(Transform, abstract=True):
     """A step that keeps some rows, possibly repeated or reordered within their cloud: write ``pick``."""
 
-    decides_within: ClassVar[bool] = False  # also among some of the rows of a cloud, as they lie: params_within
+    def decides_within(self, share: float) -> bool:
+        """Say whether the step can decide among so large a part of a cloud's rows, as they lie: ``params_within``."""
+        return False
 
-    def params_within(self, data: PointCloud, within: Tensor) -> Params:
-        """Decide what stays of the rows that a (N,) bool mask has, as if they were all; ``index`` is of all rows."""
-        raise NotImplementedError(f"{type(self).__name__}: write the method params_within(self, data, within)")
+    def params_within(self, data: PointCloud, within: Tensor, ptr: Tensor) -> Params:
+        """Decide what stays of the rows that a (N,) bool mask has, as if they were all; ``index`` is of all rows.
+
+        Row pointers are those of the rows that the mask has.
+        """
+        raise NotImplementedError(f"{type(self).__name__}: write the method params_within(self, data, within, ptr)")
 
     def looks_at(self) -> Collection[str] | None:
         """The per-point fields that picking looks at, ``source_index`` for the image; None = it may look at any."""
@@ -69,7 +74,11 @@ class SelectTransform(Transform, abstract=True):
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Pick the rows of every field."""
-        return data.select(params["index"], params["ptr"])
+        return self.with_facts(data.select(params["index"], params["ptr"]), data, params)
+
+    def with_facts(self, result: PointCloud, data: PointCloud, params: Params) -> PointCloud:
+        """Return the result with what was found out about the data beside the rows: nothing."""
+        return result
 
 
 class DropLimit(Transform, abstract=True):

@@ -61,7 +61,7 @@ def looked_at(steps: Sequence[Transform]) -> set[str]:
 
 def pick_together(steps: Sequence[Transform]) -> bool:
     """Say whether a step behind the first may decide among the rows that the one before it keeps."""
-    return any(isinstance(step, SelectTransform) and step.decides_within for step in steps[1:])
+    return any(_decides_within(step, 1.0) for step in steps[1:])
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,7 @@ def _run(
     step: Transform, cloud: PointCloud, chosen: Params | None, behind: Transform | None
 ) -> tuple[PointCloud, Params | None]:
     """Run one step; return also what is chosen of the cloud, where the step behind it takes that as it lies."""
-    may_wait = isinstance(behind, SelectTransform) and behind.decides_within and cloud.device.type == "cpu"
+    may_wait = cloud.device.type == "cpu" and _decides_within(behind, 1.0)
     if chosen is None and not (may_wait and type(step).transform is SelectTransform.transform):
         return step(cloud), None
     assert isinstance(step, SelectTransform)
@@ -146,14 +146,15 @@ def _run(
     if chosen is None:
         before, params = counts_of(cloud.ptr), step.make_params(cloud, step.no_streams)
     else:
-        before, params = counts_of(chosen["ptr"]), step.params_within(cloud, chosen["index"])
+        before, params = counts_of(chosen["ptr"]), step.params_within(cloud, chosen["index"], chosen["ptr"])
     after = counts_of(params["ptr"])
     cloud = step.recorded_counts(cloud, before, after, params, rows=step.told_rows(cloud, params))
-    if may_wait and _is_most(params["index"], sum(after)) and is_known(FINITE, cloud.points):
-        return cloud, params
+    index = params["index"]
+    may_wait = may_wait and index.dtype is torch.bool and is_known(FINITE, cloud.points)
+    if may_wait and _decides_within(behind, sum(after) / max(1, len(index))):
+        return step.with_facts(cloud, cloud, params), params
     return step.transform(cloud, params), None
 
 
-def _is_most(index: Tensor, count: int) -> bool:
-    """Say whether it is a mask, and has so many rows that it does not cost much to pass over the others."""
-    return index.dtype is torch.bool and 2 * count >= len(index)
+def _decides_within(step: Transform | None, share: float) -> bool:
+    return isinstance(step, SelectTransform) and step.decides_within(share)

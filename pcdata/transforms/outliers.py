@@ -53,7 +53,6 @@ class RemoveRadiusOutliers(RemoveTransform):
     """Drop points with no more than ``min_neighbors`` points, themselves included, within a radius (Open3D's rule)."""
 
     runs_statistics = True
-    decides_within = True
 
     min_neighbors: Count = 5
     radius: Annotated[Metres, FromSensor(SensorProfile.outlier_radius)] = 0.01
@@ -69,7 +68,11 @@ class RemoveRadiusOutliers(RemoveTransform):
         )
         return kept_params(outlier, cloud.ptr, gone=True)
 
-    def params_within(self, data: PointCloud, within: Tensor) -> Params:
+    def decides_within(self, share: float) -> bool:
+        """Where it does not have to pass over more rows than it looks at."""
+        return share >= 0.5
+
+    def params_within(self, data: PointCloud, within: Tensor, ptr: Tensor) -> Params:
         """Keep the rows with company among some."""
         fields = self.min_neighbors, self.radius, data.image_grid()
         outlier = radius_outliers_within(data.points, data.ptr, within, *fields)

@@ -248,9 +248,9 @@ class RemovePlane(RemoveTransform):
         return "neither side" if abs(side) < self.distance else "sensor"
 
     @torch_on_one_thread()
-    def transform(self, data: PointCloud, params: Params) -> PointCloud:
-        """Keep the rows and store the planes in the source frame."""
-        return data.select(params["index"], params["ptr"]).with_meta(self._entries(data, params))
+    def with_facts(self, result: PointCloud, data: PointCloud, params: Params) -> PointCloud:
+        """Store the planes in the source frame."""
+        return result.with_meta(self._entries(data, params))
 
     def fixed_work(self, like: FixedRows) -> Callable[[FixedRows], FixedRows] | None:
         """Find the plane with the most inliers and remove the slab about it; whatever else is asked needs the host."""

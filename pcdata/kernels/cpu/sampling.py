@@ -28,10 +28,26 @@ def farthest_rows(points: Tensor, ptr: Tensor, counts: list[int]) -> Tensor:
     picks, wanted = room(sum(counts), torch.int64), numbers(counts)
     arrays = points.contiguous(), ptr.contiguous(), len(counts)
     if width == 3:
-        call("pc_farthest_points", *arrays, wanted, picks)
+        call("pc_farthest_points", *arrays, None, len(points), wanted, picks, None)
     else:
         call("pc_wide_farthest_points", *arrays, width, wanted, picks)
-    return picks if len(counts) == 1 else picks.add_(torch.repeat_interleave(ptr[:-1], wanted))
+    return _of_all_clouds(picks, ptr, wanted)
+
+
+@kernel("farthest_rows_within", "cpu")
+def farthest_rows_within(points: Tensor, ptr: Tensor, within: Tensor, counts: list[int]) -> tuple[Tensor, Tensor]:
+    """Gather the points within, and tell of the picks where they were."""
+    if len(points) > _MAX_ROWS:
+        found: tuple[Tensor, Tensor] = INNER["farthest_rows_within"].reference(points, ptr, within, counts)
+        return found
+    rows, picks, wanted = room(sum(counts), torch.int64), room(sum(counts), torch.int64), numbers(counts)
+    arrays = points.contiguous(), ptr.contiguous(), len(counts), within.contiguous(), len(points)
+    call("pc_farthest_points", *arrays, wanted, picks, rows)
+    return rows, _of_all_clouds(picks, ptr, wanted)
+
+
+def _of_all_clouds(picks: Tensor, ptr: Tensor, wanted: Tensor) -> Tensor:
+    return picks if len(wanted) == 1 else picks.add_(torch.repeat_interleave(ptr[:-1], wanted))
 
 
 @kernel("voxel_means", "cpu")

@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x45E45FAD1E92B33
+INTERFACE_NUMBER = 0x556D9619C2BE3FF
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -110,7 +110,8 @@ pc_statistical_outliers: float* points, int64* ptr, int64 num_clouds, int64 num_
 pc_radius_outlier_mask: float* points, int64* ptr, int64 clouds, double radius, int64 min_neighbors, int64* pixel, int64
     width, uint8* within, uint8* outlier, double* largest
 pc_dbscan: float* points, int64* ptr, int64 clouds, double eps, int64 min_points, int64* labels, double* largest
-pc_farthest_points: float* points, int64* ptr, int64 num_clouds, int64* wanted, int64* picks
+pc_farthest_points: float* points, int64* ptr, int64 num_clouds, uint8* within, int64 num_rows, int64* wanted, int64*
+    picks, int64* rows
 pc_wide_farthest_points: float* points, int64* ptr, int64 num_clouds, int64 width, int64* wanted, int64* picks
 pc_voxel_downsample: float* points, int64* ptr, int64 num_clouds, double* sizes, double* origins, float* means, int64*
     inverse, int64* members, int64* counts, int64* spans_too_many

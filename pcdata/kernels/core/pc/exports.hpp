@@ -440,12 +440,15 @@ PC_EXPORT int32_t pc_dbscan(const pc_context* context, const float* points, cons
 
 // -- sampling ---------------------------------------------------------------------------------------------------------
 
-// points (N, 3); ptr, (num_clouds+1,); wanted (num_clouds,), at most the points there are; picks (sum of wanted,): rows
-// within each pick's own cloud. A cloud holds less than 2^31 points.
+// points (num_rows, 3), of which those within, a mask, are all that there are; null: all are. ptr (num_clouds+1,) of
+// these; wanted (num_clouds,), at most the points there are; picks (sum of wanted,): rows within each pick's own cloud,
+// counted among those within; rows (sum of wanted,): of points, written where a mask is given. A cloud holds less than
+// 2^31 points, and all rows less than 2^32 where a mask is given.
 PC_EXPORT int32_t pc_farthest_points(const pc_context* context, const float* points, const int64_t* ptr,
-                                     int64_t num_clouds, const int64_t* wanted, int64_t* picks);
+                                     int64_t num_clouds, const uint8_t* within, int64_t num_rows, const int64_t* wanted,
+                                     int64_t* picks, int64_t* rows);
 
-// The same for points (N, width).
+// The same for all points of (N, width).
 PC_EXPORT int32_t pc_wide_farthest_points(const pc_context* context, const float* points, const int64_t* ptr,
                                           int64_t num_clouds, int64_t width, const int64_t* wanted, int64_t* picks);
 

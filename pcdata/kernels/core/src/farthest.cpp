@@ -1,4 +1,5 @@
 // Farthest point sampling of ragged batches.
+#include "pc/rows/kept_points.hpp"
 #include "pc/sampling/groups.hpp"
 #include "pc/sampling/picks.hpp"
 
@@ -64,8 +65,16 @@ void sample(const pc_context& context, const float* points, const int64_t* ptr, 
 }  // namespace pc::sampling
 
 PC_EXPORT int32_t pc_farthest_points(const pc_context* context, const float* points, const int64_t* ptr,
-                                     int64_t num_clouds, const int64_t* wanted, int64_t* picks) {
+                                     int64_t num_clouds, const uint8_t* within, int64_t num_rows, const int64_t* wanted,
+                                     int64_t* picks, int64_t* rows) {
   using namespace pc;
   using namespace pc::sampling;
-  return guarded([&] { sample(*context, points, ptr, num_clouds, wanted, picks); });
+  return guarded([&] {
+    if (within == nullptr) return sample(*context, points, ptr, num_clouds, wanted, picks);
+    ScratchFrame scratch;
+    const auto kept = pc::rows::gather_kept_points(*context, scratch, points, within, num_rows, ptr[num_clouds]);
+    sample(*context, kept.points, ptr, num_clouds, wanted, picks);
+    for (int64_t cloud = 0; cloud < num_clouds; ++cloud)
+      for (int64_t k = 0; k < wanted[cloud]; ++k) *rows++ = kept.rows[ptr[cloud] + *picks++];
+  });
 }
