@@ -71,14 +71,7 @@ def window_medians(
     Those are the 3 x 3 pixels of a grid that have a point; without a grid the 9 nearest points, itself among them.
     """
     if grid is None:
-        return torch.cat(
-            [
-                values[start:stop][knn(points[start:stop], k=min(_WINDOW, stop - start))[0]].median(1).values
-                for start, stop in pairwise(bounds_of(ptr))
-                if stop > start
-            ]
-            or [values]
-        )
+        return _medians_around(values, ptr, _around(points, ptr))
     height, width = grid.size
     medians = []
     for start, stop in pairwise(bounds_of(ptr)):
@@ -92,6 +85,20 @@ def window_medians(
         middle[broken] = torch.stack([one[broken] for one in around], 1).nanmedian(1).values
         medians.append(middle)
     return torch.cat(medians)
+
+
+def _around(points: Tensor, ptr: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Return for every cloud that has points the up to 9 nearest of each, itself among them: index and distance."""
+    return [
+        knn(points[start:stop], k=min(_WINDOW, stop - start))
+        for start, stop in pairwise(bounds_of(ptr))
+        if stop > start
+    ]
+
+
+def _medians_around(values: Tensor, ptr: Tensor, around: Sequence[tuple[Tensor, Tensor]]) -> Tensor:
+    own = [values[start:stop] for start, stop in pairwise(bounds_of(ptr)) if stop > start]
+    return torch.cat([rows[index].median(1).values for rows, (index, _) in zip(own, around)] or [values])
 
 
 def _middle_of_nine(values: list[Tensor]) -> Tensor:
@@ -197,8 +204,13 @@ def table_surface(
     if max_noise is not None:
         believed &= ~(sigmas / side > max_noise)  # NaN is not known to be more
     spread = torch.cat([fit.noise * reach[start:stop] for fit, (start, stop) in zip(fits, _bounds(ptr))])
-    rise = window_medians((heights / spread).float(), points, ptr, grid, backend=backend)
-    something = _standing(points, ptr, rise, cut, min_height, min_size, grid, 5 * distance, backend)
+    rise = (heights / spread).float()
+    if grid is None:
+        around = _around(points, ptr)
+        rise, areas = _medians_around(rise, ptr, around), _areas_around(points, around)
+    else:
+        rise, areas = window_medians(rise, points, ptr, grid, backend=backend), None
+    something = _standing(points, ptr, rise, areas, cut, min_height, min_size, grid, 5 * distance, backend)
     if grid is not None:
         something |= enclosed_points(something, rise, min_height, ptr, grid, backend=backend)
     below = ~something & (rise < -cut) & (heights < -distance)
@@ -233,32 +245,32 @@ def _bounds(ptr: Tensor) -> list[tuple[int, int]]:
     return list(pairwise(bounds_of(ptr)))
 
 
-def point_areas(points: Tensor, ptr: Tensor, grid: ImageGrid | None) -> Tensor:  # (N,) float64
-    """Return the area that each point stands for: that of its pixel at its depth, or what its neighbors leave to it.
+def _pixel_areas(points: Tensor, ptr: Tensor, grid: ImageGrid) -> Tensor:  # (N,) float64
+    """Return the area that each point stands for: that of its pixel at its depth.
 
     Pixels are taken as facing the camera; an area that leans away is larger.
     """
-    if grid is not None:
-        cloud = cloud_of_rows(ptr)
-        focal = (grid.intrinsics[:, 0, 0] * grid.intrinsics[:, 1, 1]).double().abs()
-        depth = points[:, 2].double()
-        if grid.camera_from_points is not None:
-            row = grid.camera_from_points[:, 2].double()
-            depth = (points.double() * row[cloud, :3]).sum(1) + row[cloud, 3]
-        return depth.square() / focal[cloud]
-    areas = []
-    for start, stop in _bounds(ptr):
-        # A disk that reaches to the eighth neighbor holds nine points, of which those on the rim count half.
-        around = min(_WINDOW, stop - start)
-        far = knn(points[start:stop], k=around)[1][:, -1].double() if around else points.new_zeros(0).double()
-        areas.append(math.pi * far.square() / max(around, 1))
-    return torch.cat(areas)
+    cloud = cloud_of_rows(ptr)
+    focal = (grid.intrinsics[:, 0, 0] * grid.intrinsics[:, 1, 1]).double().abs()
+    depth = points[:, 2].double()
+    if grid.camera_from_points is not None:
+        row = grid.camera_from_points[:, 2].double()
+        depth = (points.double() * row[cloud, :3]).sum(1) + row[cloud, 3]
+    return depth.square() / focal[cloud]
+
+
+def _areas_around(points: Tensor, around: Sequence[tuple[Tensor, Tensor]]) -> Tensor:  # (N,) float64
+    """Return the area that each point stands for: what its nearest neighbors leave to it."""
+    # A disk that reaches to the eighth neighbor holds nine points, of which those on the rim count half.
+    areas = [math.pi * distance[:, -1].double().square() / distance.shape[1] for _, distance in around]
+    return torch.cat(areas or [points.new_zeros(0, dtype=torch.float64)])
 
 
 def _standing(
     points: Tensor,
     ptr: Tensor,
     rise: Tensor,
+    areas: Tensor | None,  # (N,) float64 that points stand for; None = those of their pixels
     cut: float,
     min_height: float,
     min_size: float,
@@ -269,14 +281,14 @@ def _standing(
     """Mark the suspects that are something: in connected parts that cover enough at more than the least height."""
     suspect = rise > cut
     fields = {"points": points, "rise": rise}
-    if grid is None:
-        fields["area"] = point_areas(points, ptr, None)  # neighbors of all points
-    else:
+    if areas is not None:
+        fields["area"] = areas
+    if grid is not None:
         fields["pixel"] = grid.pixel_index
     own, own_ptr = pick_rows(fields, suspect), ptr_after_mask(suspect, ptr)
     if grid is not None:
         on = ImageGrid(own["pixel"], grid.size, grid.intrinsics, grid.camera_from_points)
-        own["area"] = point_areas(own["points"], own_ptr, on)
+        own["area"] = _pixel_areas(own["points"], own_ptr, on)
     part, num_parts = _connected(own["points"], own_ptr, own.get("pixel"), grid, ptr, reach, backend)
     high = torch.where(own["rise"] > min_height, own["area"], 0.0)
     covered = torch.zeros(num_parts, dtype=torch.float64, device=points.device).index_add_(0, part, high.double())

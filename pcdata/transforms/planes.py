@@ -169,12 +169,9 @@ class RemovePlane(RemoveTransform):
         points = data.points.detach()
         patch, corners, rms = plane_surfaces(points, data.ptr, own, planes.cpu(), self.distance)
         if self.keep == "over":
-            parts = [slice(*pair) for pair in pairwise(bounds_of(data.ptr))]
-            over = [
-                over_hull(points[part], points[part][patch[part]], plane, self.margin)
-                for part, plane in zip(parts, planes)
-            ]
-            keep &= torch.cat(over)
+            for (start, stop), plane in zip(pairwise(bounds_of(data.ptr)), planes):
+                mine, kept = points[start:stop], keep[start:stop]
+                kept[kept.clone()] = over_hull(mine[kept], mine[patch[start:stop]], plane, self.margin)
         is_slab = gone is None and self.keep == "both"
         return {
             "index": keep,
