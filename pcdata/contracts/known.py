@@ -23,6 +23,7 @@ FINITE = "finite"  # no value is NaN or infinite
 NOT_NEGATIVE = "not negative"  # no value is below 0
 RIGID = "rigid"  # motions that an image grid may have
 METRES = "metres"  # half of the depths look like metres
+UNSHARED = "unshared"  # a step of the chain has made it, and nobody outside the chain can change it
 _OF_VALUES = (FINITE, NOT_NEGATIVE, METRES)
 
 _Held = tuple[tuple["weakref.ref[Tensor]", int], ...]

@@ -6,6 +6,8 @@ So a step of a batch is noted once, and not in a dictionary for each of its clou
 from __future__ import annotations
 
 import itertools
+import weakref
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Protocol, TypeVar
 
@@ -134,7 +136,7 @@ def _parsed(name: str, text: bytes, kind: type, told: Any) -> list[Any]:
 class MadeWhenRead:
     """Facts of each of B clouds that cost something to find out: found out when somebody reads them."""
 
-    __slots__ = ("_count", "_found", "_make")
+    __slots__ = ("__weakref__", "_count", "_found", "_make")
 
     def __init__(self, count: int, make: Callable[[], Sequence[Step]]) -> None:
         self._count = count
@@ -144,7 +146,8 @@ class MadeWhenRead:
     def __len__(self) -> int:
         return self._count
 
-    def _all(self) -> Sequence[Step]:
+    def find_out(self) -> Sequence[Step]:
+        """Return them, and keep them from now on instead of what tells them."""
         make = self._make
         if make is not None:  # another thread that asks meanwhile finds out the same
             self._found = make()
@@ -152,13 +155,30 @@ class MadeWhenRead:
         return self._found
 
     def __getitem__(self, clouds: slice) -> MadeWhenRead:
-        return MadeWhenRead(len(range(*clouds.indices(self._count))), lambda: self._all()[clouds])
+        return MadeWhenRead(len(range(*clouds.indices(self._count))), lambda: self.find_out()[clouds])
 
     def __iter__(self) -> Iterator[Step]:
-        return map(dict, self._all())
+        return map(dict, self.find_out())
 
     def __reduce__(self) -> tuple[Any, ...]:
         return list, (list(self),)
+
+
+_MOST_WAITING = 4
+_waiting: deque[weakref.ref[MadeWhenRead]] = deque()
+
+
+def put_off(facts: MadeWhenRead) -> MadeWhenRead:
+    """Return facts that hold much memory until they are read: those that were put off long before are found out now.
+
+    So clouds whose facts nobody reads cost no time if they go soon, and little memory if they stay.
+    """
+    _waiting.append(weakref.ref(facts))
+    while len(_waiting) > _MOST_WAITING:
+        oldest = _waiting.popleft()()
+        if oldest is not None:
+            oldest.find_out()
+    return facts
 
 
 # -- as clouds hold them -----------------------------------------------------------------------------------------------

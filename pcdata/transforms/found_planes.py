@@ -85,21 +85,28 @@ def _mapped(planes: NDArray[np.float64], old_from_new: NDArray[np.float64]) -> N
         return moved / np.sqrt(x * x + y * y + z * z)[:, None]
 
 
+Surfaces = tuple[NDArray[np.floating], Tensor, Tensor]  # places of corners (B, C, 3), their rows, -1 = none, RMS (B,)
+
+
+def surfaces_seen(points: Tensor, corners: Tensor, rms: Tensor) -> Surfaces:
+    """Return what is told of surfaces whose corners are rows of the points."""
+    return _places(points, corners), corners, rms
+
+
 def plane_facts(
     cloud: PointCloud,
     planes: NDArray[np.float64],  # (B, 4) in the clouds' coordinates
     num_inliers: Tensor,  # (B,) points near each, of walls that cross it too
-    corners: Tensor,  # of their surfaces, (B, C) rows, -1 behind the last
-    rms: Tensor,  # (B,)
+    surfaces: Callable[[], Surfaces],
 ) -> Callable[[], list[dict[str, Any]]]:
     """Return what finds out what is stored of each cloud's plane: itself, its share, its spread, and its hull.
 
-    All in the source frame. The cloud is read at once, and its points are not kept in memory.
+    All in the source frame. Of the cloud nothing is kept in memory but by ``surfaces``.
     """
-    places, matrices = _places(cloud.points.detach(), corners), cloud.source_from_cloud.cpu().numpy().copy()
-    counts, frame = counts_of(cloud.ptr), cloud.source_frame
+    matrices, counts, frame = cloud.source_from_cloud.cpu().numpy().copy(), counts_of(cloud.ptr), cloud.source_frame
 
     def facts() -> list[dict[str, Any]]:
+        places, corners, rms = surfaces()
         source_planes = _mapped(planes, np.linalg.inv(matrices))
         hulls = _hulls(places, planes, matrices).round(_DIGITS).tolist()
         num_corners = np.count_nonzero(corners.numpy() >= 0, axis=1).tolist()

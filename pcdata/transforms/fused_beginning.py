@@ -13,7 +13,7 @@ from collections.abc import Collection, Sequence
 import torch
 from torch import Tensor
 
-from pcdata.contracts.known import FINITE, note
+from pcdata.contracts.known import FINITE, UNSHARED, note
 from pcdata.contracts.on_host import counts_of, read_together
 from pcdata.errors import PcdataError
 from pcdata.functional.depth.boxed import deproject_into_box
@@ -121,6 +121,7 @@ def _run(
         return None
     made, readings = done
     note(FINITE, made.points)  # they are within the box
+    note(UNSHARED, made.points)
     if frame.num_views == 1:
         note(pixels_rise(frame.size), made.source_index, made.ptr)
     cloud = derived(

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pcdata.contracts.known import FINITE, is_known
+from pcdata.contracts.known import FINITE, UNSHARED, is_known, note
 from pcdata.contracts.on_host import counts_of
 from pcdata.errors import PcdataError
 from pcdata.functional.rows import pick_rows
@@ -153,7 +153,9 @@ def _run(
     may_wait = may_wait and index.dtype is torch.bool and is_known(FINITE, cloud.points)
     if may_wait and _decides_within(behind, sum(after) / max(1, len(index))):
         return step.with_facts(cloud, cloud, params), params
-    return step.transform(cloud, params), None
+    cloud = step.transform(cloud, params)
+    note(UNSHARED, cloud.points)
+    return cloud, None
 
 
 def _decides_within(step: Transform | None, share: float) -> bool:

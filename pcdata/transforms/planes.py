@@ -15,6 +15,7 @@ from torch import Tensor
 from pcdata.contracts.asked_later import is_set
 from pcdata.contracts.dispatch import roomy_body
 from pcdata.contracts.host import negated
+from pcdata.contracts.known import UNSHARED, is_known
 from pcdata.contracts.on_host import bounds_of, counts_of
 from pcdata.errors import ConfigError
 from pcdata.functional.fixed_rows import FixedRows, move_kept
@@ -30,13 +31,13 @@ from pcdata.functional.table_surface import table_surface
 from pcdata.geometry import rigid
 from pcdata.rng import Streams
 from pcdata.structures import CAMERA_FRAME, METRE, PointCloud
-from pcdata.structures.read_later import MadeWhenRead, OfClouds
+from pcdata.structures.read_later import MadeWhenRead, OfClouds, put_off
 from pcdata.threads import torch_on_one_thread
 from pcdata.transforms.base import Params, sample_name
 from pcdata.transforms.decisions import Decisions
 from pcdata.transforms.families import GEOMETRY, RemoveTransform
 from pcdata.transforms.field_types import Count, Metres, Name, Vec3
-from pcdata.transforms.found_planes import guessed_planes, plane_facts, plane_guesses
+from pcdata.transforms.found_planes import Surfaces, guessed_planes, plane_facts, plane_guesses, surfaces_seen
 from pcdata.transforms.plane_alarms import warn_of_no_table, warn_of_tilt
 
 # Radians: a plane that holds `up` to within 5 degrees has no upper side; a table's or a wall's own tilt reaches that.
@@ -156,6 +157,9 @@ class RemovePlane(RemoveTransform):
         height: Tensor | None = None,
     ) -> Params:
         """Say which rows stay beside the points of each cloud's plane, by their height above it."""
+        if gone is None and self.keep == "both" and is_known(UNSHARED, data.points):
+            keep, kept_ptr, _ = kept_rows(own, data.ptr, gone=True)
+            return {"index": keep, "ptr": kept_ptr, "planes": planes, "num_inliers": (data.ptr - kept_ptr).diff()}
         keep, kept_ptr, _ = kept_rows(own if gone is None else gone, data.ptr, gone=True)
         if self.keep != "both":
             for b, plane in enumerate(planes.tolist()):
@@ -283,7 +287,7 @@ class RemovePlane(RemoveTransform):
     def _entries(self, data: PointCloud, params: Params) -> MadeWhenRead:
         """Return what the meta of each cloud is told of its plane; most of it is found out when somebody reads it."""
         planes = params["planes"].detach().cpu().numpy()
-        facts = plane_facts(data, planes, params["num_inliers"], params["corners"], params["rms"])
+        facts = plane_facts(data, planes, params["num_inliers"], self._surfaces(data, params))
         more = [self._judged(data, params, b, plane) for b, plane in enumerate(planes.tolist())]
         before = [[*meta.get("planes", ())] for meta in data.meta]
 
@@ -293,7 +297,16 @@ class RemovePlane(RemoveTransform):
                 for had, found, judged in zip(before, facts(), more, strict=True)
             ]
 
-        return MadeWhenRead(len(more), entries)
+        made = MadeWhenRead(len(more), entries)
+        return made if "rms" in params else put_off(made)
+
+    def _surfaces(self, data: PointCloud, params: Params) -> Callable[[], Surfaces]:
+        """Return what tells the surfaces of planes: found out when it is asked, where nobody changes the points."""
+        points, ptr, kept, planes = data.points.detach(), data.ptr, params["index"], params["planes"].cpu()
+        if "rms" in params:
+            found = surfaces_seen(points, params["corners"], params["rms"])
+            return lambda: found
+        return lambda: surfaces_seen(points, *plane_surfaces(points, ptr, negated(kept), planes, self.distance)[1:])
 
     def _judged(self, data: PointCloud, params: Params, b: int, plane: Sequence[float]) -> dict[str, Any]:
         """Return what is told of a plane beside where it is, and warn of what is odd about it."""

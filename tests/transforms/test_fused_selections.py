@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import pickle
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -12,6 +13,7 @@ import torch
 
 from pcdata.contracts.dispatch import why_unavailable
 from pcdata.errors import ConfigError, TooFewPointsError
+from pcdata.functional.plane_surfaces import plane_surfaces
 from pcdata.functional.rows import pick_rows, ptr_after_mask
 from pcdata.rng import Streams
 from pcdata.structures import DepthFrame, Kind, PointCloud
@@ -264,6 +266,50 @@ def test_the_usual_steps_run_together_and_are_told_pass_by_pass(together):
     points = [sum(of_cloud[-6 + step]["points"] for of_cloud in history) for step in (1, 3, 5)]
     positions = [range(3), range(3, 5), range(5, 7)]
     assert told == [(steps, count, lean) for steps, count in zip(positions, points, strict=True)]
+
+
+@pytest.fixture
+def surfaces_found(monkeypatch) -> list[int]:
+    """Of how many points the surface of a plane was looked for."""
+    found: list[int] = []
+
+    def noted(points, *others):
+        found.append(len(points))
+        return plane_surfaces(points, *others)
+
+    monkeypatch.setattr("pcdata.transforms.planes.plane_surfaces", noted)
+    return found
+
+
+def test_where_the_surface_of_a_plane_ends_is_found_out_when_somebody_reads_it(surfaces_found):
+    expected = step_by_step(Compose(CHAINS["usual"]), FULL)
+    surfaces_found.clear()
+    result = run(Compose(CHAINS["usual"]), FULL)
+    assert not surfaces_found
+    assert result.meta == expected.meta
+    assert result.meta[0]["planes"][0]["hull"]
+    assert surfaces_found == [sum(of_cloud[-2]["points_before"] for of_cloud in expected.history)]
+    again = run(Compose(CHAINS["usual"]), FULL)
+    assert pickle.loads(pickle.dumps(again)).meta == expected.meta
+
+
+def test_clouds_that_stay_hold_no_more_points_of_others_than_a_few(surfaces_found):
+    clouds = [run(Compose(CHAINS["usual"]), FULL) for _ in range(10)]
+    assert 6 <= len(surfaces_found) < 10
+    assert all(cloud.meta == clouds[0].meta for cloud in clouds)
+    assert len(surfaces_found) == 10
+
+
+def test_of_clouds_of_others_all_is_found_out_at_once(surfaces_found):
+    cloud = whole_cloud()
+    expected = RemovePlane(num_hypotheses=50)(whole_cloud()).meta
+    for steps in (USUAL[2:], [*USUAL[2:], FarthestPointSample(num_points=8)]):
+        surfaces_found.clear()
+        result = Compose(steps)(cloud)
+        assert surfaces_found == [cloud.num_points]
+        cloud.points.mul_(3)
+        assert result.meta == expected
+        cloud.points.copy_(whole_cloud().points)
 
 
 def refusals() -> dict[str, list[Any]]:
