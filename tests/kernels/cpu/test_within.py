@@ -27,7 +27,7 @@ def radii(count: int, scale: float, seed: int = 0) -> Tensor:
     return scale * (0.05 + torch.rand(count, generator=torch.Generator().manual_seed(seed)))
 
 
-@pytest.mark.parametrize("scale", [1e-20, 1e3, 9e18])
+@pytest.mark.parametrize("scale", [1e-13, 1e3, 9e18])
 def test_lengths_of_any_size_list_as_the_reference_does(scale: float):
     points, ptr = MANY[MANY_PTR[-9] :], MANY_PTR[-9:] - MANY_PTR[-9]
     assert_equal(F.radius_neighbors, points, ptr, radius=scale)
