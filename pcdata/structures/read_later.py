@@ -251,6 +251,19 @@ class Metas(_Facts):
             together.update(one)
         return together
 
+    def at_hand(self, b: int) -> dict[str, Any]:
+        """Return what is told of a cloud without finding anything out."""
+        one = self[b : b + 1]
+        more = (step for step in one._more if not isinstance(step, MadeWhenRead))
+        (own,) = itertools.chain.from_iterable(one._parts)
+        return self._together(own, [next(iter(step)) for step in more])
+
+
+def meta_at_hand(clouds: Any, b: int) -> Mapping[str, Any]:
+    """Return what the meta of one of some clouds tells without finding anything out: who they are, and alike."""
+    held = vars(clouds)["meta"]
+    return held.at_hand(b) if isinstance(held, Metas) else held[b]
+
 
 class ReadLater:
     """An attribute of clouds with a fact of each: a tuple, as everybody sees it.

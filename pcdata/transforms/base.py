@@ -33,7 +33,7 @@ from pcdata.errors import (
 from pcdata.registry import Registry
 from pcdata.rng import GeneratorLike, Streams
 from pcdata.structures import METRE, DepthFrame, PointCloud
-from pcdata.structures.read_later import OfClouds
+from pcdata.structures.read_later import OfClouds, meta_at_hand
 from pcdata.transforms.class_checks import check_class, undeclared_streams, watched
 from pcdata.transforms.decisions import Decision, Decisions, Entry
 from pcdata.transforms.field_checks import field_names, length_fields, validated_fields
@@ -398,13 +398,13 @@ def num_clouds(data: Data) -> int:
 def _sample_id(data: Any) -> str | None:
     """The sample id of one capture or one cloud; None = it has none, or there are several clouds."""
     if isinstance(data, PointCloud):
-        return data.meta[0].get("sample_id") if data.num_clouds == 1 else None
+        return meta_at_hand(data, 0).get("sample_id") if data.num_clouds == 1 else None
     return data.sample_id if isinstance(data, DepthFrame) else None
 
 
 def sample_name(cloud: PointCloud, b: int) -> str:
     """Return `` (sample 'id')`` for messages, or nothing when the cloud has no sample id."""
-    sample = cloud.meta[b].get("sample_id")
+    sample = meta_at_hand(cloud, b).get("sample_id")
     return f" (sample {sample!r})" if sample else ""
 
 

@@ -38,7 +38,7 @@ from pcdata.transforms import (
     ToFrame,
 )
 from pcdata.transforms import fused_selections as fused
-from pcdata.transforms.base import REGISTRY
+from pcdata.transforms.base import REGISTRY, sample_name
 from tests.factories import assert_same
 from tests.transforms.examples import ALL, NAMES
 
@@ -290,6 +290,8 @@ def test_where_the_surface_of_a_plane_ends_is_found_out_when_somebody_reads_it(s
     assert result.meta[0]["planes"][0]["hull"]
     assert surfaces_found == [sum(of_cloud[-2]["points_before"] for of_cloud in expected.history)]
     again = run(Compose(CHAINS["usual"]), FULL)
+    assert [sample_name(again, b) for b in range(2)] == [" (sample 'scene')"] * 2
+    assert len(surfaces_found) == 1
     assert pickle.loads(pickle.dumps(again)).meta == expected.meta
 
 
