@@ -191,7 +191,8 @@ class YamlDocument(Document):
             self.fault_at(fault.problem_mark, str(fault.problem))
             self.raise_faults()
         except yaml.MarkedYAMLError as fault:
-            self.fault_at(fault.problem_mark, f"not valid YAML: {fault.problem:.200}")
+            way = "; indent with spaces, a tab is none" if "'\\t'" in str(fault.problem) else ""
+            self.fault_at(fault.problem_mark, f"not valid YAML: {fault.problem:.200}{way}")
             self.raise_faults()
         except yaml.YAMLError as fault:
             raise error(f"{name}: not valid YAML: {fault}") from fault

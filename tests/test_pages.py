@@ -1,36 +1,39 @@
-"""The Python that pages show: it parses, and what it imports from pcdata is there; that of some pages runs."""
+"""Every page is found: links lead from the README to all of docs/, and none leads nowhere."""
 
 from __future__ import annotations
 
-import ast
-import importlib
 import re
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
-PAGES = sorted([*(ROOT / "docs").rglob("*.md"), *ROOT.glob("*.md")])
-RUN = ("fusion.md",)  # pages whose blocks, one after another, need nothing but pcdata
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-def python_blocks(page: Path) -> list[str]:
-    return re.findall(r"^```python\n(.*?)^```", page.read_text(encoding="utf-8"), flags=re.MULTILINE | re.DOTALL)
+def linked(page: Path) -> set[Path]:
+    """The files and folders of this project that a page links to; a folder is the README in it."""
+    found = set()
+    for target in re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text(encoding="utf-8")):
+        if not re.match(r"[a-z]+:", target):
+            path = (page.parent / target).resolve()
+            found.add(path / "README.md" if (path / "README.md").is_file() else path)
+    return found
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_what_pages_import_is_there(page):
-    for block in python_blocks(page):
-        for node in ast.walk(ast.parse(block)):
-            if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "pcdata":
-                module = importlib.import_module(node.module)
-                missing = [one.name for one in node.names if not hasattr(module, one.name)]
-                for name in missing:  # a module that nothing has loaded yet
-                    importlib.import_module(f"{node.module}.{name}")
+def test_every_link_to_a_file_leads_somewhere() -> None:
+    lost = [f"{page.relative_to(ROOT)}: {path}" for page in PAGES for path in linked(page) if not path.exists()]
+    assert not lost
 
 
-@pytest.mark.parametrize("name", RUN)
-def test_pages_run(name):
-    blocks = python_blocks(ROOT / "docs" / name)
-    assert len(blocks) > 1
-    exec(compile("\n".join(blocks), name, "exec"), {})
+def test_every_page_is_reached_from_the_readme() -> None:
+    reached, ahead = set(), [ROOT / "README.md"]
+    while ahead:
+        page = ahead.pop()
+        if page not in reached:
+            reached.add(page)
+            ahead += [path for path in linked(page) if path.suffix == ".md" and path.is_file()]
+    assert [str(page.relative_to(ROOT)) for page in PAGES if page not in reached] == []
+
+
+def test_the_list_of_pages_has_every_page_of_its_folder() -> None:
+    folder = ROOT / "docs"
+    assert set(folder.glob("*.md")) - linked(folder / "README.md") == {folder / "README.md"}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,8 @@ def _checked_target(arguments: argparse.Namespace) -> Path:
         raise ConfigError(f"fuse: an .npz holds the whole volume, which {flag} cannot change; write a .ply, or drop it")
     if not out.parent.is_dir():
         raise ConfigError(f"fuse: there is no folder {out.parent} to write into; make it, or choose another")
+    if not os.access(out.parent, os.W_OK):  # told before all captures are read
+        raise ConfigError(f"fuse: there is no permission to write into {out.parent}; choose another folder")
     if out.is_dir():
         raise ConfigError(f"fuse: {out} is a folder; name a file")
     if out.exists() and not arguments.overwrite:

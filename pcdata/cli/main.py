@@ -78,6 +78,7 @@ def _run(argv: Sequence[str] | None) -> int:
 def _parsed(words: Sequence[str]) -> argparse.Namespace:
     """Read the words; of one that the command does not know, say which it may have been."""
     parser = _parser()
+    _refuse_unknown_command(parser, words)
     arguments, unknown = parser.parse_known_args(words)
     if not unknown:
         return arguments
@@ -87,6 +88,20 @@ def _parsed(words: Sequence[str]) -> argparse.Namespace:
     flags = [flag for action in parser._actions for flag in action.option_strings]
     strange = next((word for word in unknown if word.startswith("-")), unknown[0])
     parser.error(f"unrecognized arguments: {' '.join(unknown)}{near_matches(strange.partition('=')[0], flags)}")
+
+
+def _refuse_unknown_command(parser: argparse.ArgumentParser, words: Sequence[str]) -> None:
+    """Say which command may have been meant; argparse would list them all, in an order of its own."""
+    for word in words:
+        below = next((one for one in parser._actions if isinstance(one, argparse._SubParsersAction)), None)
+        if below is None or word.startswith("-"):
+            if word in ("-h", "--help") or below is None:
+                return
+            continue
+        if word not in below.choices:
+            hint = near_matches(word, below.choices)
+            parser.error(f"there is no command {word!r}{hint}; {parser.prog} --help lists them")
+        parser = below.choices[word]
 
 
 def _refuse_empty(arguments: argparse.Namespace) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import mmap
 import os
+import shlex
 import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -270,7 +271,8 @@ def _check_inside(
     if not any(real.is_relative_to(folder) for folder in folders):
         raise error(
             f"{told_at(where, file)}: leads out of {folders[0]}, to {real}; files outside are not read unless you "
-            f"name the folder that links may lead to: links_to={str(real.parent)!r}"
+            f"name the folder that links may lead to: links_to={str(real.parent)!r} "
+            f"(--links-to {shlex.quote(str(real.parent))})"
         )
     if opened is not None and not os.path.samestat(os.stat(real), opened):
         raise error(f"{told_at(where, file)}: was exchanged while it was opened")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import platform
+import textwrap
+from collections.abc import Iterator, Sequence
 
 import torch
 
@@ -12,6 +14,8 @@ import pcdata.functional
 from pcdata import extras
 from pcdata.contracts import dispatch
 from pcdata.report.plain_table import text_table
+
+_WIDTH = 120  # columns of a line
 
 
 def health_text() -> str:
@@ -36,7 +40,20 @@ def health_text() -> str:
     return "\n\n".join(
         [
             text_table(["machine", ""], machine),
-            text_table(["backend", "state", "serves, or what to do"], backends),
-            text_table(["optional", "state", "for, or what to do"], optional),
+            text_table(["backend", "state", "serves, or what to do"], list(_wrapped(backends))),
+            text_table(["optional", "state", "for, or what to do"], list(_wrapped(optional))),
         ]
     )
+
+
+def _wrapped(rows: Sequence[Sequence[str]]) -> Iterator[list[str]]:
+    """Yield rows whose last cell goes on in rows of its own where it is long; a command stays on one line."""
+    room = _WIDTH - sum(2 + max(map(len, column)) for column in zip(*(row[:-1] for row in rows)))
+    for *others, text in rows:
+        words, command, rest = text.partition("pip install")
+        lines = textwrap.wrap(words, room, break_on_hyphens=False)
+        if command:
+            whole = f"{lines[-1]} {command}{rest}"
+            lines[-1:] = [whole] if len(whole) <= room else [lines[-1], command + rest]
+        yield [*others, lines[0]]
+        yield from ([*["" for _ in others], line] for line in lines[1:])

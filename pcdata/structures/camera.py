@@ -238,7 +238,7 @@ class Camera(Structure):
         height, width = self.size
         lens = "".join(f", {len(values)} coefficients of {model}" for model, values in self.lenses[:1])
         focal = ", ".join(f"{k[0][0]:.1f}" for k in self.intrinsics.tolist())
-        return f"Camera({self.num_views} views, {width}x{height}, fx {focal}{lens})"
+        return f"Camera({self.num_views} view{'s' * (self.num_views != 1)}, {width}x{height}, fx {focal}{lens})"
 
 
 def check_view(where: str, index: int, num_views: int) -> None:

@@ -302,7 +302,8 @@ class DepthFrame(Structure):
         height, width = self.size
         carried = [name for name, tensor in self._tensors().items() if tensor is not None]
         told = told_signals(self.recorded_signals)
-        return f"DepthFrame({self.sample_id!r}, {self.num_views} views of {width}x{height}: {', '.join(carried)}{told})"
+        views = f"{self.num_views} view{'s' * (self.num_views != 1)}"
+        return f"DepthFrame({self.sample_id!r}, {views} of {width}x{height}: {', '.join(carried)}{told})"
 
 
 def _sample_of(depth: Tensor) -> Tensor:

@@ -112,8 +112,8 @@ def check_of_error(error: PcdataError, *, whole: bool = False) -> Finding:
         advice="mend what the message names, or give the folder that the captures are in; nothing can be read before "
         "that"
         if whole
-        else "see the message; refused wherever it is read: leave it out of a build with --skip ID, or all such ones "
-        "with --skip-refused",
+        else "mend what the message names; until then it is refused wherever it is read: leave it out of a build with "
+        "--skip ID, or all such ones with --skip-refused",
     )
 
 

@@ -168,7 +168,7 @@ def test_a_value_that_means_no_reading_is_sayable_at_every_door(capture: Path, c
     state(capture, invalid_values=[65535])
     assert open_source(capture).load("1").depth.max() < 1
     assert open_source(capture, invalid_values=[65535]).ids == ["1"]
-    with pytest.raises(CaptureError, match="drop one"):
+    with pytest.raises(CaptureError, match="correct the file if it is wrong"):
         open_source(capture, invalid_values=[4095])
 
 

@@ -24,7 +24,7 @@ import pytest
 import torch
 
 import pcdata
-from pcdata import CachedCloudDataset, PointCloud
+from pcdata import CachedCloudDataset, PointCloud, extras
 from pcdata.cli import main
 from pcdata.io import write_ply
 from pcdata.io.sources.cloud_files import CloudFilesSource
@@ -98,7 +98,7 @@ def test_help_is_on_stdout(capsys, arguments):
     ("arguments", "words"),
     [
         ([], ["required", "COMMAND"]),
-        (["biuld"], ["invalid choice", "build"]),
+        (["biuld"], ["no command 'biuld'; did you mean 'build'", "pcdata --help lists them"]),
         (["build"], ["CONFIG", "--model"]),
         (["build", "--model", "dp3_sim"], ["frame"]),
         (["build", "c.yaml", "--source", "x", "--out", "y", "--limit", "0"], ["--limit", "at least 1", "'0'"]),
@@ -123,6 +123,17 @@ def test_doctor_tells_versions_backends_and_extras(capsys):
     assert (code, err) == (0, "")
     for part in (pcdata.__version__, torch.__version__, "every operation, on any device", "torch_cluster", "open3d"):
         assert part in out
+    assert max(map(len, out.splitlines())) <= 120
+
+
+def test_doctor_says_all_of_a_long_reason_and_leaves_commands_whole(capsys, monkeypatch):
+    command = "pip install ninja && pip install --no-build-isolation a-package-of-some-length"
+    monkeypatch.setattr(extras, "why_missing", lambda module: f"{'it is needed for much ' * 8}: run {command}")
+    code, out, err = run(capsys, "doctor")
+    assert (code, err) == (0, "")
+    assert max(map(len, out.splitlines())) <= 120
+    assert out.count(command) == len(extras.EXTRAS)
+    assert " ".join(out.split()).count("it is needed for") == 8 * len(extras.EXTRAS)
 
 
 def test_doctor_tells_what_to_install_for_what_is_absent(capsys, monkeypatch):
@@ -132,9 +143,9 @@ def test_doctor_tells_what_to_install_for_what_is_absent(capsys, monkeypatch):
     code, out, _ = run(capsys, "doctor")
     assert code == 0
     for module, command in (("matplotlib", 'pip install "pcdata[viz]"'), ("open3d", 'pip install "pcdata[open3d]"')):
-        (line,) = [line for line in out.splitlines() if line.startswith(module)]
-        assert "absent" in line
-        assert command in line
+        (row,) = re.findall(rf"^{module}(?:.*\n(?= ))*.*", out, re.MULTILINE)  # with the lines that go on with it
+        assert "absent" in row
+        assert command in row
 
 
 # -- build ---------------------------------------------------------------------------------------------------------

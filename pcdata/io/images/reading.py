@@ -126,9 +126,10 @@ def _raw_depth(where: str, mode: str, pixels: NDArray[Any], header: tuple[int, i
     if mode == "I" and bits == 16:  # Pillow before 11.3 opens 16-bit gray PNG as 32-bit integers
         return pixels.astype(np.uint16)
     words = {"L": "an 8-bit gray", "P": "a palette", "1": "a 1-bit", "RGB": "a color", "RGBA": "a color with alpha"}
+    other = "the color image, or " if mode in ("RGB", "RGBA") else ""
     raise CaptureError(
-        f"{where}: a depth image must be 16-bit gray, but this is {words.get(mode, mode)} image; is it a picture of "
-        "the depth made for viewing? Its values are no lengths: export the raw 16-bit depth"
+        f"{where}: a depth image must be 16-bit gray, but this is {words.get(mode, mode)} image; is it {other}a "
+        "picture of the depth made for viewing? Its values are no lengths: export the raw 16-bit depth"
     )
 
 

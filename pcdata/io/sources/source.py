@@ -223,4 +223,7 @@ def check_partners(where: str, ids: Iterable[str], partners: Mapping[str, Iterab
         if missing and spare:
             faults[-1] += same_but_for_writing(missing, spare)
     if faults:
-        raise CaptureError(f"{where}: every sample needs the same files: {'; '.join(faults)}")
+        raise CaptureError(
+            f"{where}: every sample needs the same files: {'; '.join(faults)}; add what is missing, or move "
+            "what has no partners out"
+        )

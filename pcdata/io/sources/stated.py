@@ -15,6 +15,7 @@ from pcdata.io.sources.listing import absolute
 from pcdata.structures import Calibration
 
 Value = TypeVar("Value")
+_WAY = "correct the file if it is wrong, else leave the argument out"
 
 
 def one_value(
@@ -26,7 +27,7 @@ def one_value(
         CaptureError: they contradict each other; or another error that is asked for.
     """
     if stated is not None and given is not None and stated != given:
-        raise error(f"{file}: says {option} {stated!r}, the argument {given!r}; drop one")
+        raise error(f"{file}: says {option} {stated!r}, the argument {given!r}; {_WAY}")
     return stated if given is None else given
 
 
@@ -61,7 +62,7 @@ def one_calibration(
     own = file.parent / stated
     if given is not None and (isinstance(given, Calibration) or absolute(given) != own):
         told = "an object" if isinstance(given, Calibration) else repr(os.fspath(given))
-        raise CaptureError(f"{file}: says calibration {stated!r}, the argument {told}; drop one")
+        raise CaptureError(f"{file}: says calibration {stated!r}, the argument {told}; {_WAY}")
     check_inside(str(file.parent), own, allowed)
     return own
 
@@ -85,5 +86,5 @@ def one_naming(
         return stated if given is None else given  # type: ignore[return-value]
     for role in stated.keys() & given.keys():
         if stated[role] != given[role]:
-            raise CaptureError(f"{file}: says folders {role} {stated[role]!r}, the argument {given[role]!r}; drop one")
+            raise CaptureError(f"{file}: says folders {role} {stated[role]!r}, the argument {given[role]!r}; {_WAY}")
     return {**stated, **given}
