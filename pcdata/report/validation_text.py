@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pcdata.errors import told_apart
+from pcdata.files.sample_names import counted
 from pcdata.report.plain_table import text_table
 from pcdata.validation import WHOLE, Summary
 from pcdata.verdicts import Finding, Verdict
@@ -28,7 +29,9 @@ def validation_text(summary: Summary) -> str:
     table = text_table(["check", "view", *map(str, Verdict), "worst", "passes"], rows)
     count = sum(summary.samples.values())
     shares = ", ".join(f"{summary.samples[verdict]} {verdict.value}" for verdict in Verdict)
-    end = f"{summary.verdict.value.upper()}: " + (f"of {count} captures {shares}" if count else "no capture was read")
+    end = f"{summary.verdict.value.upper()}: " + (
+        f"of {counted(count, 'capture')} {shares}" if count else "no capture was read"
+    )
     return "\n\n".join(part for part in (table, "\n".join(notes), end) if part)
 
 

@@ -76,8 +76,9 @@ class ToFrame(SpatialTransform):
             if name not in frames:
                 raise FrameError(
                     f"ToFrame: no pose leads from {data.frame_id!r} to {self.frame!r}: the cloud knows the frames "
-                    f"{sorted(frames)}; give the capture poses (poses/NAME.txt of a plain folder, with --frame; "
-                    "--calibration FILE; a recording's tf by --frame), or ToFrame a matrix and its start"
+                    f"{sorted(frames)}; give the capture poses (world_from_camera= of arrays; poses/NAME.txt of "
+                    "a plain folder, with --frame; --calibration FILE; a recording's tf by --frame), or ToFrame a "
+                    "matrix and its start"
                 )
         return {"matrix": frames[self.frame] @ torch.linalg.inv(frames[data.frame_id])}
 

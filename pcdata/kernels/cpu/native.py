@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pcdata.errors import BackendError
 from pcdata.kernels.cpu.signatures import DECLARATIONS, INTERFACE_NUMBER
 from pcdata.threads import core_threads
 
@@ -32,7 +33,7 @@ _HUGE_PAGE_BITS = 21
 
 _CPU = torch.device("cpu")
 
-_OK, _OUT_OF_MEMORY, _INTERRUPTED = 0, 1, 2
+_OK, _OUT_OF_MEMORY, _INTERRUPTED, _TOO_MANY_ROWS = 0, 1, 2, 4
 
 _Poll = ctypes.CFUNCTYPE(ctypes.c_int32)
 
@@ -135,6 +136,7 @@ def call(function: str, *arguments: Any) -> None:
         TypeError: an argument is not what the core's header declares.
         ValueError: a tensor is not contiguous or not in the memory of the CPU.
         MemoryError: the core could not get memory.
+        BackendError: there are more rows than it can number.
         KeyboardInterrupt: Ctrl-C (or whatever a signal handler raised) while it ran.
     """
     entry, parameters = library()[function]
@@ -153,6 +155,11 @@ def call(function: str, *arguments: Any) -> None:
         raise MemoryError(f"{function}: out of memory")
     if status == _INTERRUPTED:
         raise KeyboardInterrupt
+    if status == _TOO_MANY_ROWS:
+        raise BackendError(
+            f"{function}: the compiled core numbers up to {2**31 - 1:,} rows; give it fewer at a time, or take "
+            "backend='torch'"
+        )
     if status != _OK:
         raise RuntimeError(f"{function}: the core failed with status {status}; please report this")
 

@@ -190,9 +190,7 @@ def test_options_of_the_layout_come_from_the_configuration_and_may_not_be_contra
     assert source.invalid_values == (65535,)
     assert source.frame_id == "base"
     assert settings.open(metres_per_unit=0.001).ids == source.ids
-    with pytest.raises(
-        ConfigError, match=r"metres_per_unit 0\.001, the argument 0\.01; drop one"
-    ):
+    with pytest.raises(ConfigError, match=r"metres_per_unit 0\.001, the argument 0\.01; drop one"):
         settings.open(metres_per_unit=0.01)
 
 

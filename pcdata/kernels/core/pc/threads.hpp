@@ -21,9 +21,18 @@ using std::uint8_t;
 
 // -- a call -------------------------------------------------------------------------------------------------------
 
-enum Status : int32_t { kOk = 0, kOutOfMemory = 1, kInterrupted = 2, kFailed = 3 };
+enum Status : int32_t { kOk = 0, kOutOfMemory = 1, kInterrupted = 2, kFailed = 3, kTooManyRows = 4 };
 
 struct Interrupted : std::exception {};
+struct TooManyRows : std::exception {};
+
+// Rows, cells and pixels are numbered in 31 bits: half the memory of 64, and one bit is left to mark them.
+constexpr int64_t kMaxRows = (int64_t{1} << 31) - 1;
+
+// What numbers rows so asks this first, before it takes memory for them.
+inline void require_numbered(int64_t rows) {
+  if (rows > kMaxRows) throw TooManyRows();
+}
 
 int32_t run_call(void* body, void (*call)(void*)) noexcept;
 

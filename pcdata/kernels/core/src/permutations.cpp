@@ -38,6 +38,7 @@ int64_t choose_first(uint64_t seed, int64_t count, int64_t wanted, uint32_t* key
 
 // Write the first `wanted` rows of a permutation of [first, first + count).
 void permute(const pc_context& context, uint64_t seed, int64_t first, int64_t count, int64_t wanted, int64_t* rows) {
+  require_numbered(count);
   ScratchFrame scratch;
   const bool choose = wanted < count / 4;
   DrawnRow* drawn = scratch.take<DrawnRow>(count);

@@ -238,6 +238,8 @@ int32_t run_call(void* body, void (*call)(void*)) noexcept {
     return kOutOfMemory;
   } catch (const Interrupted&) {
     return kInterrupted;
+  } catch (const TooManyRows&) {
+    return kTooManyRows;
   } catch (...) {
     return kFailed;
   }

@@ -43,7 +43,7 @@ void for_each_cloud(const pc_context& context, const int64_t* ptr, int64_t cloud
   std::vector<int64_t> small;
   for (int64_t cloud = 0; cloud < clouds; ++cloud) {
     const int64_t count = ptr[cloud + 1] - ptr[cloud];
-    if (count > std::numeric_limits<uint32_t>::max()) throw std::bad_alloc();  // it would need 400 GB
+    require_numbered(count);
     if (count >= kLarge)
       body(context, ptr[cloud], count);
     else if (count > 0)

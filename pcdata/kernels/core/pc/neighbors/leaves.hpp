@@ -58,6 +58,7 @@ class LeafBuilder {
   LeafBuilder(const pc_context& context, ScratchFrame& scratch, const float* points, const int64_t* ptr,
               int64_t num_clouds)
       : context_(context), scratch_(scratch), points_(points), ptr_(ptr), num_clouds_(num_clouds) {
+    require_numbered(ptr[num_clouds]);
     const int64_t count = ptr[num_clouds] - ptr[0];
     keys_ = scratch.take<uint64_t>(count);
     sort(scratch.take<uint64_t>(count));

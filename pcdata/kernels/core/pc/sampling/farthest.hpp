@@ -17,6 +17,7 @@ class FarthestSampler {
 
   FarthestSampler(ScratchFrame& scratch, const float* points, int64_t count)
       : points_(points), count_(count), num_leaves_((count + kLeaf - 1) / kLeaf) {
+    require_numbered(count);
     leaves_ = scratch.take<Leaf>(num_leaves_);
     for (int64_t children = num_leaves_; levels_.empty() || children > 1;) {
       children = (children + kFan - 1) / kFan;

@@ -15,8 +15,6 @@ namespace pc::sort {
 // stray point a kilometer away does not blur the order of the rest, and only equal points stay together.
 class MortonRows {
  public:
-  static constexpr int64_t kMaxRows = int64_t{1} << 31;
-
   // Fill keys[0, end-begin) with the rows [begin, end) of points (N, 3) in Morton order; `spare` is as long.
   MortonRows(const pc_context& context, const float* points) : context_(context), points_(points) {}
 

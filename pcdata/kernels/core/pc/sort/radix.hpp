@@ -57,6 +57,7 @@ Item* radix_sort(const pc_context& context, ScratchFrame& scratch, Item* items, 
   constexpr int kLargestDigit = 11;  // 2048 write streams still fit the first-level cache
   int64_t count = 0;
   for (const Range& piece : pieces) count += piece.size();
+  require_numbered(count);
   // Few items do not pay for many counters.
   const int largest_digit = std::max(4, std::min(kLargestDigit, bits_below(static_cast<uint64_t>(count))));
   const int passes = std::max(1, (key_bits + largest_digit - 1) / largest_digit);

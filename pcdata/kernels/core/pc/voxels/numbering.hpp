@@ -32,6 +32,7 @@ struct Pieces {
 
   Pieces(const int64_t* ptr, int64_t num_clouds) {
     for (int64_t cloud = 0; cloud < num_clouds; ++cloud) {
+      require_numbered(ptr[cloud + 1] - ptr[cloud]);
       first_of.push_back(size());
       for (int64_t row = ptr[cloud]; row < ptr[cloud + 1]; row += kPiece)
         all.push_back({cloud, row, std::min(ptr[cloud + 1], row + kPiece)});

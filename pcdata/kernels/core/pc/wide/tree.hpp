@@ -41,6 +41,7 @@ class Tree {
  public:
   // Take room for `count` points; build() fills it.
   Tree(ScratchFrame& scratch, int64_t count, int64_t width) : width_(width), count_(count) {
+    require_numbered(count);
     num_leaves_ = (count + kLeaf - 1) / kLeaf;
     rows_ = scratch.take<uint32_t>(num_leaves_ * kLeaf);
     coordinates_ = scratch.take<float>(num_leaves_ * kLeaf * width);
