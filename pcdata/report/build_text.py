@@ -38,7 +38,8 @@ def build_text(report: BuildReport) -> str:
 
 def notes_of(config: BuildConfig, report: BuildReport) -> list[str]:
     """Say what was stored as asked and yet is not what training takes."""
-    return [note for note in (_whole_scenes(config, report), _too_few_points(config, report)) if note is not None]
+    told = (_whole_scenes(config, report), _views_apart(config, report), _too_few_points(config, report))
+    return [note for note in told if note is not None]
 
 
 def _whole_scenes(config: BuildConfig, report: BuildReport) -> str | None:
@@ -51,6 +52,21 @@ def _whole_scenes(config: BuildConfig, report: BuildReport) -> str | None:
     return (
         f"{contract.name} takes clouds of one object, and these hold all that the captures show: cut objects out first "
         "(docs/segmentation.md), unless the captures show one alone"
+    )
+
+
+def _views_apart(config: BuildConfig, report: BuildReport) -> str | None:
+    """Say that a sample of a model holds the views of its capture one by one, where nothing joined them."""
+    steps = {type(step).__name__ for step in config.pipeline.parts()}
+    if config.model is None or steps & {"MergeViews", "FuseTSDF", *OBJECT_STEPS}:
+        return None
+    apart = [one for one in report.samples if one.entered_at == "depth" and one.fewest_points < one.num_points]
+    if not apart:
+        return None
+    return (
+        f"{counted(len(apart), 'sample')} made of several views: a cloud of each by itself, in the frame of its own "
+        "camera; name the frame that all poses lead to (--set frame=NAME) for one cloud of all views, or read one "
+        "camera (--camera NAME, or its folder)"
     )
 
 

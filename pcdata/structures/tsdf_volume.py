@@ -193,8 +193,9 @@ class TSDFVolume:
             )
         if frame.world_from_camera is None:
             raise FrameError(
-                f"TSDFVolume: {frame!r} has no world_from_camera, so its views cannot be put together; give the "
-                "capture poses"
+                f"TSDFVolume: {frame!r} has no world_from_camera, so its views cannot be put together; give it poses: "
+                "world_from_camera= of arrays, poses/NAME.txt of a plain folder, --calibration FILE --frame NAME, or "
+                "--posed FILE"
             )
         if self.frame_id is not None and frame.frame_id != self.frame_id:
             raise FrameError(

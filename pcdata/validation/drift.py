@@ -106,7 +106,7 @@ def _starts(count: int, window: int, num_windows: int, *, own: bool) -> list[int
         raise CaptureError(
             f"measure_drift: needs {needed} captures or more ({window} are averaged"
             f"{', the first are what the others are compared with' if own else ''}), the source has {count}; give a "
-            "longer recording, or a smaller window"
+            "longer recording, or a smaller window (--window N)"
         )
     return np.unique(np.linspace(begin, last, min(num_windows, last - begin + 1)).round().astype(int)).tolist()
 

@@ -84,6 +84,16 @@ def test_samples_that_training_will_refuse_are_told(capsys, config, captures, tm
     assert "will be refused" not in out
 
 
+def test_views_of_a_model_that_nothing_joins_are_told(capsys, tmp_path):
+    write_capture(tabletop_frame(2), tmp_path / "rig")
+    words = ["--model", "dp3_sim", "--set", "crop=none", "--source", tmp_path / "rig"]
+    for frame, is_told in (("camera", True), ("base", False)):
+        code, out, err = run(capsys, "build", *words, "--set", f"frame={frame}", "--out", tmp_path / frame)
+        assert code == 0, err
+        assert ("1 sample made of several views: a cloud of each by itself" in out) == is_told
+        assert CachedCloudDataset(tmp_path / frame)[0].num_clouds == 1 + is_told
+
+
 def test_training_refuses_a_sample_by_its_smallest_cloud(capsys, tmp_path):
     frame = tabletop_frame(2)
     fewest = int((frame.depth[1, :30] > 0).sum())

@@ -102,7 +102,7 @@ def test_captures_that_cannot_be_fused_are_exit_1_in_words(capsys, captures, tmp
     assert fuse(captures, tmp_path / "a.ply", "--voxel-size", "0.0005", "--max-megabytes", "1") == 1
     assert "use larger voxels" in capsys.readouterr().err
     assert fuse(captures, tmp_path / "a.ply", "--folder", "pose=") == 1
-    assert "give the capture poses" in capsys.readouterr().err
+    assert "give it poses" in capsys.readouterr().err
     assert fuse(captures, tmp_path / "cloud.ply") == 0
     assert fuse(tmp_path / "cloud.ply", tmp_path / "a.ply") == 1
     assert "takes a DepthFrame, got PointCloud" in capsys.readouterr().err
