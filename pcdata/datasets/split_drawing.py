@@ -112,7 +112,10 @@ def _counts(where: str, parts: Parts, total: int, noun: str) -> dict[str, int]:
         del counts[rest[0]]
     left = total - sum(counts.values())
     if left < len(rest):
-        raise ConfigError(f"{where}: there are not enough {noun}, every part needs one {told}")
+        raise ConfigError(
+            f"{where}: there are not enough {noun} for {len(parts)} parts, {told}; name fewer parts (--parts "
+            "train=1.0), or keep less together (--by sample)"
+        )
     if left and not rest:
         raise ConfigError(f"{where}: {left} {noun} would be in no part; give one part None, or name those too {told}")
     return {name: counts.get(name, left) for name in parts}

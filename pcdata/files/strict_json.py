@@ -78,7 +78,8 @@ def json_object(where: str, text: str | bytes, *, error: type[PcdataError]) -> d
             _check_whole_characters(text)
         data = parse_json(text)
     except ValueError as cause:
-        raise error(f"{where}: not valid JSON: {str(cause)[:300]}") from cause
+        way = "; it is damaged: copy it again, or make it anew" if issubclass(error, CacheError) else ""
+        raise error(f"{where}: not valid JSON: {str(cause)[:300]}{way}") from cause
     if not isinstance(data, dict):
         raise error(f"{where}: must be a JSON object, got a {type(data).__name__}")
     return data

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +23,8 @@ def read_samples(path: str | Path, contract: ModelContract, keys: Mapping[str, s
     Args:
         path: a .npz, .npy, .h5 or .hdf5 file, or a zarr v2 directory.
         contract: what the arrays are read for.
-        keys: from a tensor of the model, or points, colors, normals, to the name in the file. Points and their
+        keys: from a tensor of the model, or points, colors, normals, to the name in the file; {} = the arrays that have
+            the very names of all of the model's tensors, in whatever folder of the file. Points and their
             companions are joined in the model's order of channels; arrays of (samples, points, channels) are cut into
             samples.
 
@@ -39,6 +40,8 @@ def read_samples(path: str | Path, contract: ModelContract, keys: Mapping[str, s
             raise ConfigError(f"{contract.name}: no key {name!r}{near_matches(name, known)}; it has {', '.join(known)}")
     if not keys:
         found = stored_names(path)  # what kind of file is wrong comes before which array is what
+        keys = _own_names(contract, found)
+    if not keys:
         which = "it is one array, without a name: --keys points=" if found == [""] else f"it has {shown_names(found)}"
         raise ConfigError(
             f"{contract.name}: {path}: say which array is what, as in --keys points=NAME; {which}; the keys are "
@@ -66,6 +69,15 @@ def read_samples(path: str | Path, contract: ModelContract, keys: Mapping[str, s
                 {key: _as_read(part, _spec(contract, key).dtype) for key, part in whole.items()},
                 channels,
             )
+
+
+def _own_names(contract: ModelContract, found: Sequence[str]) -> dict[str, str]:
+    """Return which array is which tensor, where one of each name is there and none may be a part of points; else {}."""
+    wanted = [spec.key for spec in contract.tensors]
+    named = {key: [name for name in found if name.rpartition("/")[2] == key] for key in wanted}
+    if set(wanted) & set(ROLES) or any(len(names) != 1 for names in named.values()):
+        return {}
+    return {key: names[0] for key, names in named.items()}
 
 
 # -- which arrays go together ------------------------------------------------------------------------------------------

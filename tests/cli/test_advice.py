@@ -80,3 +80,16 @@ def test_one_view_is_told_in_the_singular() -> None:
     assert "1 view of " in repr(tabletop_frame(1))
     assert "2 views of " in repr(tabletop_frame(2))
     assert "Camera(1 view, " in repr(tabletop_frame(1).camera)
+
+
+def test_a_damaged_dataset_and_too_few_groups_say_what_to_do(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "set"
+    words = ["build", "--model", "dp3_sim", "--set", "frame=base", "--set", "crop=none", "--source", capture]
+    assert main([str(word) for word in [*words, "--out", out]]) == 0
+    assert "not enough groups for 3 parts, of 1 groups" in (said := told(capsys, "split", out))
+    assert "--parts train=1.0" in said
+    assert main(["split", str(out), "--parts", "train=1.0", "--no-check"]) == 0
+    (out / "dataset.json").write_bytes((out / "dataset.json").read_bytes()[:100])
+    assert "copy it again, or make it anew" in told(capsys, "inspect", out)

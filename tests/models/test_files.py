@@ -287,3 +287,25 @@ def test_the_page_on_wrong_frames_quotes_what_was_measured():
         assert f"| {name} | {row['mean']:.0%} | {row['worst']:.0%} |".replace("%", " %") in page
         assert row["refused"] in page
     assert not measured["trainings"]["base, metres"]["refused"]
+
+
+def test_arrays_named_as_the_tensors_of_the_model_need_no_keys(tmp_path):
+    clouds = np.random.default_rng(0).random((3, 512, 6), np.float32)
+    np.savez(tmp_path / "own.npz", point_cloud=clouds, other=np.zeros(3))
+    given = {"frame_id": "base", "unit": "m", "frame": "base"}
+    told = check_files(tmp_path / "own.npz", "dp3_sim", {}, **given)
+    asked = check_files(tmp_path / "own.npz", "dp3_sim", {"point_cloud": "point_cloud"}, **given)
+    assert {name: entry.counts for name, entry in told.checks.items()} == {
+        name: entry.counts for name, entry in asked.checks.items()
+    }
+    with h5py.File(tmp_path / "two.h5", "w") as file:  # of two of one name none is taken
+        file["a/point_cloud"], file["b/point_cloud"] = clouds, clouds
+    with pytest.raises(ConfigError, match="say which array is what"):
+        check_files(tmp_path / "two.h5", "dp3_sim", {}, **given)
+
+
+def test_a_file_that_is_not_there_is_not_called_damaged(tmp_path):
+    for name in ("a.npz", "a.npy", "a.h5"):
+        with pytest.raises(CacheError, match="no such file") as caught:
+            check_files(tmp_path / name, "dp3_sim", {})
+        assert "damaged" not in str(caught.value)

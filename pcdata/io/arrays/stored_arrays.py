@@ -69,6 +69,7 @@ def stored_arrays(path: str | Path, names: Collection[str]) -> Iterator[dict[str
         found = {"": map_npy("check", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError)}
         yield _arrays(path, {name: _named(path, found, name) for name in names})
     elif path.suffix == ".npz":
+        existing_file("check", path, max_bytes=MAX_STREAMED_BYTES, error=CacheError)
         with _damage_named(str(path)):
             chosen = _from_npz(path, names)
         yield _arrays(path, chosen)

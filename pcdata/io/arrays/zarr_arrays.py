@@ -45,7 +45,10 @@ def zarr_names(folder: Path, most: int) -> list[str]:
         raise CacheError(f"{folder}: is zarr v3, which loaders that pin zarr 2 cannot open; write it as v2")
     names = sorted(islice(_names_below(folder), most))
     if not names:
-        raise CacheError(f"{folder}: holds no zarr v2 array (no .zarray); is it the folder of a dataset?")
+        raise CacheError(
+            f"{folder}: holds no zarr v2 array (no .zarray); give the folder or file with the arrays of a "
+            "data set. Captures are judged by 'pcdata validate'"
+        )
     return names
 
 
