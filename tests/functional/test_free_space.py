@@ -11,7 +11,7 @@ from pcdata.functional.touching.basins import find_basins
 from pcdata.functional.touching.chords import Sight, free_chords
 from pcdata.functional.touching.contacts import Contacts
 from pcdata.functional.touching.faces import Scene
-from pcdata.functional.touching.limits import KINECT_NOISE
+from pcdata.functional.touching.limits import KINECT_NOISE, Limits
 from pcdata.functional.touching.regions import PixelCamera
 
 CAMERA = PixelCamera(100.0, 100.0, 49.5, 49.5)
@@ -23,7 +23,8 @@ def sight(depth: torch.Tensor, camera_from_points: torch.Tensor | None = None) -
     label = torch.where(depth > 0, 0, -1)
     contacts = Contacts(none, none, none.double())
     return Sight(
-        Scene(inverse, label, torch.zeros(*depth.shape, 3), None, contacts, CAMERA, KINECT_NOISE), camera_from_points
+        Scene(inverse, label, torch.zeros(*depth.shape, 3), None, contacts, CAMERA, KINECT_NOISE, Limits()),
+        camera_from_points,
     )
 
 

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from pcdata.functional.touching.contacts import Contacts
+from pcdata.functional.touching.limits import RAMP, Limits
 from pcdata.functional.touching.regions import PixelCamera
 
 _SAMPLE = 150  # points of a face that distances are taken between
@@ -29,6 +30,7 @@ class Scene:
     contacts: Contacts
     camera: PixelCamera
     noise: float
+    limits: Limits
 
     @cached_property
     def num_regions(self) -> int:
@@ -56,6 +58,26 @@ class Scene:
         """Return the points of some regions together."""
         pixels = self.pixels[regions[0]] if len(regions) == 1 else torch.cat([self.pixels[r] for r in regions])
         return Face(self, pixels)
+
+    def highest_up_ramps(self, pixels: Tensor) -> Tensor:
+        """Return the largest height in their regions that ramps lead to from pixels (n,): the pixels' own, or more.
+
+        A ramp comes nearer to the camera faster than any surface that is followed, over a dozen pixels at most. Of
+        every so many-th pixel where there are many; only where the scene has heights.
+        """
+        assert self.height is not None
+        pixels = pixels[:: max(1, len(pixels) // _SAMPLE)].to(self.label.device)
+        height, width = self.label.shape
+        offset = torch.arange(-RAMP, RAMP + 1, dtype=torch.int64, device=pixels.device)
+        row, column = (pixels // width)[:, None, None] + offset[:, None], (pixels % width)[:, None, None] + offset
+        inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+        near = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
+        label, inverse = self.label.flatten(), self.inverse.flatten()
+        apart = (offset[:, None] ** 2 + offset**2).double().sqrt() * inverse[near] / self.camera.fx
+        steep = inverse[near] - inverse[pixels][:, None, None] > self.limits.slope * apart
+        steep[:, RAMP, RAMP] = True  # the pixel itself
+        same = inside & (label[near] == label[pixels][:, None, None])
+        return torch.where(same & steep, self.height.flatten()[near], -math.inf).flatten(1).amax(1)
 
     def seen_between(self, points: Tensor) -> tuple[float, float, float, float]:
         """Return which parts of points (K, 3) lie behind what is seen, on it, in front of it, and where nothing is."""

@@ -133,7 +133,6 @@ def join_hollows(objects: Objects) -> None:
     faces = {one: objects.face(regions) for one, regions in members.items()}
     contacts = objects.contacts()
     depth = scene.points[:, 2].cpu()
-    height = scene.height.flatten().cpu()
     for start, face in faces.items():
         if face.area < _HOLLOW or not (face.hollow[0] > _HOLLOW_RISE and face.hollow[1] > _HOLLOW_PART):
             continue
@@ -151,7 +150,7 @@ def join_hollows(objects: Objects) -> None:
                 part = faces[other]
                 is_below = part.top < rim + _RIM
                 is_inside = part.hollow[0] > _NOT_CONVEX and abs(behind) < _WITHIN and is_below
-                is_wall = any(_is_wall(objects, pair, objects.object_of[one], rim, depth, height) for pair in regions)
+                is_wall = any(_is_wall(objects, pair, objects.object_of[one], rim, depth) for pair in regions)
                 if not (is_inside or is_wall or (is_below and part.area < _SLIVER)):
                     continue
                 seen.add(other)
@@ -160,12 +159,11 @@ def join_hollows(objects: Objects) -> None:
                     todo.append(other)
 
 
-def _is_wall(
-    objects: Objects, pair: tuple[int, int], inside: int, rim: float, depth: torch.Tensor, height: torch.Tensor
-) -> bool:
+def _is_wall(objects: Objects, pair: tuple[int, int], inside: int, rim: float, depth: torch.Tensor) -> bool:
     """Say whether of two regions in contact, one of object ``inside``, the other meets it at the rim, not behind it.
 
-    Not the other's object as a whole: other parts of the wall may have joined it already.
+    Not the other's object as a whole: other parts of the wall may have joined it already. Nor the height of the contact
+    itself: where the sensor smears the step at the rim, it hangs between both.
     """
     own, beside = objects.contact_pixels([pair], inside)
     if len(own) < _CONTACT_PIXELS:
@@ -175,7 +173,7 @@ def _is_wall(
         part.hollow[0] <= _HOLLOW_RISE
         and abs(part.top - rim) < _WALL_RIM
         and float((depth[beside] - depth[own]).median()) < objects.scene.noise * float(depth[own].median()) ** 2
-        and float(height[beside].median()) > part.top - _RIM
+        and float(objects.scene.highest_up_ramps(beside).median()) > part.top - _RIM
     )
 
 

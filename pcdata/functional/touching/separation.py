@@ -130,7 +130,7 @@ def regions_of(
         image = torch.zeros(inverse.numel(), 3, dtype=torch.float64, device=points.device)
         image[pixel] = colors.double()
         contacts = with_colors(contacts, regions.label, image)
-    scene = Scene(inverse, regions.label, regions.normals, heights, contacts, camera, noise)
+    scene = Scene(inverse, regions.label, regions.normals, heights, contacts, camera, noise, limits)
     return Objects(scene), regions.label.view(-1)[pixel]
 
 

@@ -1,0 +1,71 @@
+"""Scene.highest_up_ramps: what a sensor has smeared is passed, surfaces are not followed."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from pcdata.functional.touching.contacts import Contacts
+from pcdata.functional.touching.faces import Scene
+from pcdata.functional.touching.limits import KINECT_NOISE, RAMP, Limits
+from pcdata.functional.touching.regions import PixelCamera
+
+CAMERA = PixelCamera(500.0, 500.0, 29.5, 19.5)
+ROWS, COLUMNS = 40, 60
+
+
+def scene(inverse: torch.Tensor, height: torch.Tensor, label: torch.Tensor) -> Scene:
+    none = torch.empty(0, dtype=torch.int64)
+    normals = torch.zeros(*inverse.shape, 3, dtype=torch.float64)
+    return Scene(inverse, label, normals, height, Contacts(none, none, none.double()), CAMERA, KINECT_NOISE, Limits())
+
+
+def rows(values: list[float]) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)[:, None].expand(ROWS, COLUMNS).clone()
+
+
+def smeared_step(length: int, nearest: float = 0.72) -> Scene:
+    """Show a wall before what is above it in the image, 0.8 m away; the step is smeared over rows from 15 on."""
+    part = ((torch.arange(ROWS, dtype=torch.float64) - 15) / length).clamp(0, 1)
+    inverse = 1 / 0.80 + part * (1 / nearest - 1 / 0.80)
+    height = 0.04 + 0.05 * part
+    label = (torch.arange(ROWS)[:, None] >= 15 + length // 2).long().expand(ROWS, COLUMNS)
+    return scene(rows(inverse.tolist()), rows(height.tolist()), label.clone())
+
+
+@pytest.mark.parametrize("repeated", [1, 2])
+@pytest.mark.parametrize("length", [2, 6, 10])
+def test_the_rim_is_seen_over_a_smeared_step(length, repeated):
+    found = smeared_step(length)
+    if repeated > 1:
+        found = scene(*(one[::2].repeat_interleave(2, 0) for one in (found.inverse, found.height, found.label)))
+    label = found.label[:, 0]
+    contact = int((label == 1).nonzero()[0])  # hangs between both
+    assert float(found.height[contact, 0]) < 0.08
+    pixels = contact * COLUMNS + torch.arange(COLUMNS)
+    assert torch.allclose(found.highest_up_ramps(pixels), torch.tensor(0.09, dtype=torch.float64))
+
+
+@pytest.mark.parametrize("degrees", [0, 45, 65])
+def test_surfaces_are_not_followed(degrees):
+    # A plane through (0, 0, 0.8) that comes nearer with the rows: on it 1/z is linear in them.
+    down = torch.arange(ROWS, dtype=torch.float64) - CAMERA.cy
+    inverse = 1 / 0.8 * (1 + math.tan(math.radians(degrees)) * down / CAMERA.fy)
+    flat = scene(rows(inverse.tolist()), rows((0.1 + 0.001 * down).tolist()), torch.zeros(ROWS, COLUMNS).long())
+    pixels = torch.arange(ROWS * COLUMNS)[:: ROWS * COLUMNS // 100]
+    assert torch.equal(flat.highest_up_ramps(pixels), flat.height.flatten()[pixels])
+
+
+def test_nor_is_what_another_region_has_or_is_farther_than_ramps_are_long():
+    found = smeared_step(6, nearest=0.5)
+    label = found.label.clone()
+    label[19:] = 2
+    other = scene(found.inverse, found.height, label)
+    pixels = 18 * COLUMNS + torch.arange(COLUMNS)
+    assert torch.equal(other.highest_up_ramps(pixels), other.height[18])
+    far = scene(found.inverse, rows([0.04] * 15 + [0.05] * (3 + RAMP + 1) + [0.2] * (ROWS - 19 - RAMP)), found.label)
+    assert torch.equal(far.highest_up_ramps(pixels), far.height[18])
+    far.height[18 + RAMP] = 0.2
+    assert torch.equal(far.highest_up_ramps(pixels), torch.full_like(far.height[18], 0.2))
