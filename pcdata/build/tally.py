@@ -119,10 +119,11 @@ class Tally:
 def all_failed(failed: Mapping[str, str], num_samples: int) -> PcdataError:
     """Return the error of a build of which nothing comes: of the type that the first capture raised."""
     sample_id, reason = next(iter(failed.items()))
-    which = f"all of the first {len(failed)}" if len(failed) < num_samples else f"all {num_samples}"
+    which = f"all of the first {len(failed)} captures" if len(failed) < num_samples else f"all {num_samples} captures"
+    which = "the only capture" if num_samples == 1 else which
     error = told_error(
         reason,
-        f"build_dataset: {which} captures failed, so the configuration or the source is at fault and nothing can "
+        f"build_dataset: {which} failed, so the configuration or the source is at fault and nothing can "
         f"be stored; {sample_id!r}: {reason}",
     )
     step = re.match(r"\w+ in (\w+)", reason)  # as shard_work.error_in_words writes it

@@ -56,11 +56,10 @@ def steps_of_sections(document: Document, entries: Mapping[str, tuple[Any, Any]]
         for step, node in placed:
             if not issubclass(gives, step.takes):
                 right = "cloud" if section == "depth" else "depth"
-                document.fault(
-                    node,
-                    f"{type(step).__name__} takes a {step.takes.__name__}; it belongs into the section {right}, not "
-                    f"{section}",
-                )
+                way = f"it belongs into the section {right}, not {section}"
+                if section == "depth" and not issubclass(step.takes, PointCloud):
+                    way = "the steps before it give a cloud already: put it before them, or leave it out"
+                document.fault(node, f"{type(step).__name__} takes a {step.takes.__name__}; {way}")
                 break
             gives = step.gives
     if sections.get("depth") and (sections.get("cloud") or sections.get("augment")):

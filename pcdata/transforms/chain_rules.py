@@ -36,7 +36,11 @@ def check_chain(steps: Sequence[Transform]) -> None:
         for step in outer.parts() if outer._modules else (outer,):
             needed = step.frame_needed()
             if frame is not None and needed is not None and needed != frame:
-                raise _misfit(position, step, f"works in frame {needed!r} but the cloud is in {frame!r} there")
+                way = f"put ToFrame(frame={needed!r}) before it"
+                if frame.startswith(f"{needed}/"):  # no pose leads back from what a step made of each cloud's points
+                    way = f"put it before the step that leaves {needed!r}"
+                what = f"works in frame {needed!r} but the cloud is in {frame!r} there; {way}"
+                raise _misfit(position, step, what)
             wanted = step.unit_needed()
             if unit is not None and wanted is not None and wanted != unit:
                 names = {METRE: "in metres", NORMALIZED: "normalized"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, TypeVar, get_args, get_type_hints
@@ -125,7 +126,10 @@ def _fault_message(cls: type, fault: Any) -> str:
         known = field_names(cls)
         return f"no such field{near_matches(name, known) or f'; {cls.__name__} has {list(known)}'}"
     given = "" if fault["type"] == "missing" else f" (got {fault['input']!r})"
-    return f"{fault['msg']}{given}"
+    limits = fault.get("ctx", {})
+    is_angle = any(limits.get(name) in (math.pi / 2, math.pi, 2 * math.pi) for name in ("le", "lt"))
+    way = "; it is in radians, a degree is 0.01745 of them" if is_angle else ""
+    return f"{fault['msg']}{given}{way}"
 
 
 def _as_plain(value: Any) -> Any:

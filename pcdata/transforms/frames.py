@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.on_host import bounds_of, counts_of
-from pcdata.errors import ConfigError, FrameError, PcdataError, ReplayError
+from pcdata.errors import ConfigError, FrameError, PcdataError, ReplayError, near_matches
 from pcdata.functional.rows import cloud_of_rows, ptr_from_counts
 from pcdata.functional.voxel_averages import voxel_majority
 from pcdata.functional.voxels import voxel_downsample
@@ -74,9 +74,10 @@ class ToFrame(SpatialTransform):
         frames = _known_frames(data)
         for name in (self.frame, data.frame_id):
             if name not in frames:
+                hint = near_matches(name, frames)
                 raise FrameError(
                     f"ToFrame: no pose leads from {data.frame_id!r} to {self.frame!r}: the cloud knows the frames "
-                    f"{sorted(frames)}; give the capture poses (world_from_camera= of arrays; poses/NAME.txt of "
+                    f"{sorted(frames)}{hint}; give the capture poses (world_from_camera= of arrays; poses/NAME.txt of "
                     "a plain folder, with --frame; --calibration FILE; a recording's tf by --frame), or ToFrame a "
                     "matrix and its start"
                 )

@@ -112,12 +112,17 @@ def test_sections_must_fit_together():
     assert told("depth:\n- Center\n- Deproject") == (
         "p.yaml:2:3: Center takes a PointCloud; it belongs into the section cloud, not depth"
     )
+    assert told("depth: [Deproject, Deproject]") == (
+        "p.yaml:1:20: Deproject takes a DepthFrame; the steps before it give a cloud already: put it before them, or "
+        "leave it out"
+    )
     for section in ("cloud", "augment"):
         assert told(f"{section}:\n- Center\n- Deproject") == (
             f"p.yaml:3:3: Deproject takes a DepthFrame; it belongs into the section depth, not {section}"
         )
     assert told(f"depth: [Deproject]\ncloud:\n- {box}") == (
-        "p.yaml:3:3: step 2, CropWorkspace, works in frame 'base' but the cloud is in 'camera' there"
+        "p.yaml:3:3: step 2, CropWorkspace, works in frame 'base' but the cloud is in 'camera' there; put "
+        "ToFrame(frame='base') before it"
     )
 
 

@@ -12,8 +12,10 @@ from pcdata.geometry import rigid
 from pcdata.structures import PointCloud
 from pcdata.synthetic import tabletop
 from pcdata.transforms import (
+    Center,
     ClusterObjects,
     Compose,
+    CropWorkspace,
     Deproject,
     EstimateNormals,
     MergeViews,
@@ -216,3 +218,26 @@ def test_the_frame_of_the_source_is_known_without_being_listed():
     matrix = [[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
     replaced = ToFrame(frame="base", start="camera", matrix=matrix)(cloud)
     assert torch.equal(replaced.signals["goal"], torch.zeros(1, 3))  # in base, as it says, and the cloud is there
+
+
+def test_a_frame_that_is_nearly_known_is_named() -> None:
+    cloud = PointCloud(points=torch.rand(5, 3), frame_id="base")
+    with pytest.raises(FrameError, match=r"knows the frames \['base'\]; did you mean 'base'"):
+        ToFrame(frame="bsae")(cloud)
+
+
+def test_an_angle_in_degrees_is_told_to_be_in_radians() -> None:
+    with pytest.raises(ConfigError, match=r"max_tilt: .* \(got 20\); it is in radians"):
+        RemovePlane(distance=0.01, up=(0, 0, 1), frame="base", max_tilt=20)
+
+
+def test_what_a_chain_asks_for_makes_it_fit() -> None:
+    cloud = PointCloud(points=torch.rand(5, 3), frame_id="base")
+    box = CropWorkspace(frame="base", lower=(-9, -9, -9), upper=(9, 9, 9))
+    table = ToFrame(frame="table", matrix=torch.eye(4).tolist(), start="base")
+    with pytest.raises(ConfigError, match=r"put ToFrame\(frame='base'\) before it"):
+        Compose([table, box])
+    torch.testing.assert_close(Compose([table, ToFrame(frame="base"), box])(cloud).points, cloud.points)
+    with pytest.raises(ConfigError, match="put it before the step that leaves 'base'"):
+        Compose([ToFrame(frame="base"), Center(), box])
+    assert Compose([ToFrame(frame="base"), box, Center()])(cloud).frame_id == "base/centered"
