@@ -69,14 +69,32 @@ def _fuse(arguments: argparse.Namespace) -> None:
         what = f"volume of {volume.num_blocks:,} blocks, {volume.num_bytes / 2**20:.0f} MiB"
     elif arguments.mesh:
         mesh = volume.extract_mesh(min_weight=least)
+        _require_surface(mesh.vertices.num_points, arguments)
         write_ply(out, mesh)
         what = f"mesh of {mesh.vertices.num_points:,} points, {len(mesh.triangles):,} triangles"
     else:
         cloud = volume.extract_points(min_weight=least)
+        _require_surface(cloud.num_points, arguments)
         write_ply(out, cloud)
         what = f"cloud of {cloud.num_points:,} points"
     views = f"{counted(volume.num_views, 'view')} of {counted(len(source), 'capture')}"
     print(f"fuse  {out}  ({what} in frame {volume.frame_id!r}, from {views})")
+
+
+def _require_surface(num_points: int, arguments: argparse.Namespace) -> None:
+    """Require that something was found, before a file without a point is written.
+
+    Raises:
+        TooFewPointsError: no point of a surface.
+    """
+    from pcdata.errors import TooFewPointsError
+
+    if num_points == 0:
+        weight = "" if arguments.min_weight is None else f", or less than --min-weight {arguments.min_weight:g}"
+        raise TooFewPointsError(
+            f"fuse: no surface was found at voxels of {arguments.voxel_size:g} m: use smaller ones (--voxel-size 0.005)"
+            f"{weight}; nothing is written"
+        )
 
 
 def _checked_target(arguments: argparse.Namespace) -> Path:

@@ -60,6 +60,7 @@ def _run(argv: Sequence[str] | None) -> int:
         print(f"pcdata: {error}", file=sys.stderr)
         for note in getattr(error, "__notes__", ()):
             print(f"  {note}", file=sys.stderr)
+        _tell_how_to_leave_out(arguments, error)
         _tell_what_is_needed(words, str(error))
         return 2 if isinstance(error, ConfigError) else 1
     except BrokenPipeError:  # "pcdata inspect ... | head" has read enough
@@ -147,6 +148,16 @@ def _refuse_replacing(arguments: argparse.Namespace) -> None:
                     from pcdata.io.sources.capture_source import check_apart
 
                     check_apart(f"--{written}", place, path)
+
+
+def _tell_how_to_leave_out(arguments: argparse.Namespace, error: PcdataError) -> None:
+    """Say which options leave a capture out that stopped the command, where it takes them and nothing said so."""
+    notes = [str(note) for note in getattr(error, "__notes__", ())]
+    if not hasattr(arguments, "skip") or error.sample_id is None or any("--skip" in note for note in notes):
+        return
+    if any(note.startswith("while loading sample") for note in notes):
+        others = ", or all such captures with --skip-refused" if hasattr(arguments, "skip_refused") else ""
+        print(f"  leave it out with --skip {shlex.quote(error.sample_id)}{others}", file=sys.stderr)
 
 
 def _tell_what_is_needed(words: Sequence[str], message: str) -> None:

@@ -199,8 +199,11 @@ class Grading:
         """Say in how many captures, from which on, and in which episodes."""
         where = trend.where_worst()
         first, ever_since = trend.since()
-        told = f"in {len(where):,} of {len(trend.places):,} captures"
-        if len(where) == len(trend.places) > 1:
+        total = len(trend.places)
+        if trend.view is None and {*trend.verdicts} == {Verdict.FAIL.severity}:
+            total = int((self.sample_verdicts >= 0).sum())  # what a reader refuses is a check of what it refused alone
+        told = f"in {len(where):,} of {total:,} captures"
+        if len(where) == total > 1:
             return f"in all {len(where):,} captures"
         told += f", from {self.ids[first]!r} on" if ever_since else f", first {self.ids[first]!r}"
         if trend.verdict is Verdict.FAIL and (warning := list(trend.verdicts).count(Verdict.WARN.severity)):

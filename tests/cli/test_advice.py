@@ -12,6 +12,7 @@ import pytest
 
 from pcdata.cli import main
 from pcdata.io import write_capture
+from tests.captures import folder_capture
 from tests.factories import tabletop_frame
 
 
@@ -93,3 +94,28 @@ def test_a_damaged_dataset_and_too_few_groups_say_what_to_do(
     assert main(["split", str(out), "--parts", "train=1.0", "--no-check"]) == 0
     (out / "dataset.json").write_bytes((out / "dataset.json").read_bytes()[:100])
     assert "copy it again, or make it anew" in told(capsys, "inspect", out)
+
+
+def test_a_capture_that_stops_a_command_is_left_out_by_the_options_that_are_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = folder_capture(tmp_path / "all")
+    damaged, *_ = sorted((root / "depth").iterdir())
+    damaged.write_bytes(damaged.read_bytes()[:60])
+    name, count = damaged.stem, len(list((root / "depth").iterdir()))
+    said = told(capsys, "clouds", root, "--out", tmp_path / "out")
+    flag = re.search(r"leave it out with (--skip \S+), or all such captures with --skip-refused", said)
+    assert flag is not None
+    assert main(["clouds", str(root), "--out", str(tmp_path / "out"), *shlex.split(flag[1])]) == 0
+    capsys.readouterr()
+    main(["grade", str(root)])
+    assert f"in 1 of {count} captures, first {name!r}" in capsys.readouterr().out
+
+
+def test_a_surface_without_a_point_is_not_written(
+    capture: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for mesh in ([], ["--mesh"]):
+        said = told(capsys, "fuse", capture, "--voxel-size", "10", "--out", tmp_path / "s.ply", *mesh)
+        assert "no surface was found at voxels of 10 m: use smaller ones" in said
+        assert not (tmp_path / "s.ply").exists()
