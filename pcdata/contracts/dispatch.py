@@ -239,12 +239,14 @@ def _add_tensors(arguments: Iterable[Any], found: list[Tensor]) -> None:
             found.append(one)
         elif kind in _PLAIN:  # asking what it is an instance of, of mappings most of all, takes longer
             continue
+        elif kind is dict:
+            _add_tensors(one.values(), found)
+        elif isinstance(one, (list, tuple)):
+            _add_tensors(one, found)
         elif isinstance(one, Tensor):
             found.append(one)
         elif isinstance(one, Mapping):
             _add_tensors(one.values(), found)
-        elif isinstance(one, (list, tuple)):
-            _add_tensors(one, found)
 
 
 def _tidy(arguments: dict[str, Any], *, detach: bool, contiguous: bool) -> None:

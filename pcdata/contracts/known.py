@@ -64,7 +64,7 @@ def forget() -> None:
 
 def is_known(fact: Hashable, *tensors: Tensor) -> bool:
     """Say whether a fact about tensors, together, is known: on the host within this run of a chain."""
-    facts = _facts.get() if tensors[0].device.type == "cpu" else _elsewhere.get(tensors[0])
+    facts = _facts.get() if tensors[0].is_cpu else _elsewhere.get(tensors[0])
     if not facts:
         return False
     held = facts.get((fact, *map(id, tensors)))
@@ -82,7 +82,7 @@ def note(fact: Hashable, *tensors: Tensor) -> None:
     for tensor in tensors:
         if tensor.is_inference():  # nobody counts changes of it
             return
-    if tensors[0].device.type != "cpu":
+    if not tensors[0].is_cpu:
         facts = _elsewhere.setdefault(tensors[0], {})
     if facts is None:
         return

@@ -89,7 +89,7 @@ def checked_lengths(where: str, name: str, arguments: Mapping[str, Any]) -> Tens
     """Require one positive length for every cloud, or one per cloud (B,); bodies get (B,) float64."""
     ptr: Tensor = arguments["ptr"]
     lengths = numbers_on_host(arguments[name])
-    num_clouds = len(ptr) - 1
+    num_clouds = ptr.shape[0] - 1
     if lengths.ndim == 0:
         lengths = lengths.expand(num_clouds)
     if lengths.shape != (num_clouds,):
@@ -103,7 +103,7 @@ def checked_edges(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor
     """Require lengths as :func:`checked_lengths`, or one per axis too, (1 or B, 3): bodies get (B,) or (B, 3)."""
     ptr: Tensor = arguments["ptr"]
     edges = numbers_on_host(arguments[name])
-    num_clouds = len(ptr) - 1
+    num_clouds = ptr.shape[0] - 1
     if edges.ndim != 2:
         return checked_lengths(where, name, arguments)
     if edges.shape not in {(1, 3), (num_clouds, 3)}:
@@ -117,7 +117,7 @@ def checked_places(where: str, name: str, arguments: Mapping[str, Any]) -> Tenso
     """Require one finite point (3,) for every cloud, or one per cloud (B, 3); bodies get (B, 3) float64."""
     ptr: Tensor = arguments["ptr"]
     places = numbers_on_host(arguments[name])
-    num_clouds = len(ptr) - 1
+    num_clouds = ptr.shape[0] - 1
     if places.shape not in {(3,), (num_clouds, 3)}:
         raise ShapeError(f"{where}: {name} must be (3,) or ({num_clouds}, 3), got {tuple(places.shape)}")
     if not bool(torch.isfinite(places).all()):
@@ -141,7 +141,7 @@ def counts_per_cloud(where: str, num_samples: int | Sequence[int] | Tensor, ptr:
         ShapeError: the number of counts is not the number of clouds.
         ConfigError: a negative count.
     """
-    num_clouds = len(ptr) - 1
+    num_clouds = ptr.shape[0] - 1
     given = num_samples.tolist() if isinstance(num_samples, Tensor) else num_samples
     counts = list(given) if isinstance(given, Sequence) else [given] * num_clouds
     for count in counts:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from itertools import pairwise
+from operator import sub
 from typing import Any
 
 import torch
@@ -38,7 +39,7 @@ def hold(tensor: Tensor, copy: Tensor) -> None:
 
 def on_host(tensor: Tensor) -> Tensor:
     """Return the values in host memory, not to be changed; of a small tensor the host waits for them once."""
-    if tensor.device.type == "cpu":
+    if tensor.is_cpu:
         return tensor.detach() if tensor.requires_grad else tensor
     copy = held(tensor)
     if copy is None:
@@ -69,14 +70,14 @@ def taken(tensor: Tensor, index: int | slice) -> Tensor:
 
 def bounds_of(ptr: Tensor) -> list[int]:
     """Return row pointers as a list."""
-    bounds: list[int] = (ptr if ptr.device.type == "cpu" else on_host(ptr)).tolist()
+    bounds: list[int] = (ptr if ptr.is_cpu else on_host(ptr)).tolist()
     return bounds
 
 
 def counts_of(ptr: Tensor) -> list[int]:
     """Return the number of rows of every cloud as a list."""
-    bounds = (ptr if ptr.device.type == "cpu" else on_host(ptr)).tolist()
-    return [stop - start for start, stop in pairwise(bounds)]
+    bounds: list[int] = (ptr if ptr.is_cpu else on_host(ptr)).tolist()
+    return [*map(sub, bounds[1:], bounds)]
 
 
 def read_together(tensors: Sequence[Tensor]) -> list[list[Any]]:

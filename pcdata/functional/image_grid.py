@@ -63,15 +63,15 @@ def checked_grid(where: str, name: str, arguments: Mapping[str, Any]) -> ImageGr
         )
     if pixel.device != points.device:
         raise DeviceError(f"{where}: grid is on {pixel.device} but points is on {points.device}; move one with .to()")
-    if pixel.shape != points.shape[:1] or grid.intrinsics.shape != (len(ptr) - 1, 3, 3):
+    if pixel.shape != points.shape[:1] or grid.intrinsics.shape != (ptr.shape[0] - 1, 3, 3):
         raise ShapeError(
             f"{where}: grid has {tuple(pixel.shape)} pixels and {tuple(grid.intrinsics.shape)} intrinsics for "
             f"{len(points)} points in {len(ptr) - 1} clouds; drop the grid, or select it together with the points"
         )
     if grid.camera_from_points is not None:
-        _check_rigid(where, grid.camera_from_points, len(ptr) - 1, points.device)
+        _check_rigid(where, grid.camera_from_points, ptr.shape[0] - 1, points.device)
     fact = pixels_rise(grid.size)
-    if len(pixel) == 0 or is_known(fact, pixel, ptr):
+    if pixel.shape[0] == 0 or is_known(fact, pixel, ptr):
         return grid
     filled = counts_from_ptr(ptr) > 0
     first, last = ptr[:-1][filled], ptr[1:][filled] - 1

@@ -15,7 +15,7 @@ from pcdata.errors import ConfigError, DTypeError, ShapeError
 
 def checked_seeds(where: str, name: str, arguments: Mapping[str, Any]) -> list[int]:
     """Require one seed for every cloud, or one per cloud (B,); bodies get a list of B."""
-    seed, num_clouds = arguments[name], len(arguments["ptr"]) - 1
+    seed, num_clouds = arguments[name], arguments["ptr"].shape[0] - 1
     given = seed.tolist() if isinstance(seed, Tensor) else seed
     seeds = list(given) if isinstance(given, Sequence) else [given] * num_clouds
     if not all(isinstance(one, int) and not isinstance(one, bool) for one in seeds):
@@ -27,7 +27,7 @@ def checked_seeds(where: str, name: str, arguments: Mapping[str, Any]) -> list[i
 
 def checked_up(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
     """Require one direction for every cloud, or one per cloud; bodies get (B, 3) float64 unit vectors on the CPU."""
-    num_clouds = len(arguments["ptr"]) - 1
+    num_clouds = arguments["ptr"].shape[0] - 1
     directions = torch.as_tensor(arguments[name], dtype=torch.float64, device="cpu").detach()
     if directions.shape == (3,):
         directions = directions.expand(num_clouds, 3)
@@ -60,7 +60,7 @@ def checked_probability(where: str, name: str, arguments: Mapping[str, Any]) -> 
 def checked_guess(where: str, name: str, arguments: Mapping[str, Any]) -> Tensor:
     """Require one plane per cloud; bodies get (B, 4) float64 on the CPU with unit normals, NaN where there is none."""
     planes = torch.as_tensor(arguments[name], dtype=torch.float64, device="cpu").detach()
-    if planes.shape != (len(arguments["ptr"]) - 1, 4):
+    if planes.shape != (arguments["ptr"].shape[0] - 1, 4):
         raise ShapeError(f"{where}: guess must be ({len(arguments['ptr']) - 1}, 4), got {tuple(planes.shape)}")
     planes = planes / planes[:, :3].norm(dim=1, keepdim=True)
     return planes.masked_fill(~planes.isfinite().all(1, keepdim=True), torch.nan)

@@ -133,24 +133,23 @@ def _best_planes(
     """Return each cloud's plane with the most inliers, the earliest among equals, (B, 4)."""
     best = counts.argmax(1)  # the first of equals, as torch documents
     found = torch.stack([is_plane.sum(1), competes.sum(1), counts.gather(1, best[:, None]).squeeze(1)], 1)
-    require_planes(found, planes.shape[1], distance, first_cloud)
+    require_planes(found.tolist(), planes.shape[1], distance, first_cloud)
     return planes[torch.arange(len(planes), dtype=torch.int64, device="cpu"), best]
 
 
-def require_planes(found: Tensor, tried: int, distance: float, first_cloud: int) -> None:
+def require_planes(found: Sequence[tuple[int, ...]], tried: int, distance: float, first_cloud: int) -> None:
     """Refuse clouds without a plane.
 
     Args:
-        found: (B, 3): how many of the hypotheses are planes, how many of those compete, and how many points are near
-            the best. The first two matter where the third is less than 3.
+        found: of each cloud, how many of the hypotheses are planes, how many of those compete, and how many points are
+            near the best. The first two matter where the third is less than 3.
         tried: hypotheses about each cloud.
         distance: from a plane.
         first_cloud: the number of the first of these.
     """
-    listed = found.tolist()
-    if all(near >= 3 for _, _, near in listed):
+    if min([near for _, _, near in found]) >= 3:
         return
-    for cloud, (planes, competing, near) in enumerate(listed):
+    for cloud, (planes, competing, near) in enumerate(found):
         if near < 3 and competing == 0:
             reason = (
                 f"none of the {planes} planes found is within max_tilt of up; is up in the frame of the cloud?"
@@ -158,7 +157,7 @@ def require_planes(found: Tensor, tried: int, distance: float, first_cloud: int)
                 else f"all {tried} triples drawn lie on a line"
             )
             raise NoPlaneError(f"ransac_plane: cloud {first_cloud + cloud}: {reason}")
-    for cloud, (_, _, near) in enumerate(listed):
+    for cloud, (_, _, near) in enumerate(found):
         if near < 3:
             raise NoPlaneError(
                 f"ransac_plane: cloud {first_cloud + cloud}: no plane has 3 points nearer than distance={distance:g}; "
@@ -169,7 +168,7 @@ def require_planes(found: Tensor, tried: int, distance: float, first_cloud: int)
 def clouds_between(points: Tensor, ptr: Tensor, first: int, stop: int) -> tuple[Tensor, Tensor]:
     """Return the clouds [first, stop) of a batch."""
     own = ptr[first : stop + 1]
-    if stop - first == len(ptr) - 1:
+    if stop - first == ptr.shape[0] - 1:
         return points, ptr
     return points[int(own[0]) : int(own[-1])], own - own[0]
 

@@ -58,6 +58,19 @@ def words_drawn(seed: int, count: int, device: torch.device) -> Tensor | None:
     return uploaded(torch.from_numpy(words), device)
 
 
+@functools.lru_cache(maxsize=_KEPT)
+def _words_of_any(count: int, seeds: tuple[int, ...]) -> tuple[Tensor, Tensor] | None:
+    """Return what serves clouds of any size; None where seeds are many, or torch draws otherwise."""
+    number: dict[int, int] = {}
+    which = [number.setdefault(seed, len(number)) for seed in seeds]
+    if len(number) > _KEPT:
+        return None
+    kept = [words for seed in number if (words := words_drawn(seed, count, torch.device("cpu"))) is not None]
+    if len(kept) < len(number):
+        return None
+    return torch.stack(kept), torch.from_numpy(np.array(which, np.int64))
+
+
 def words_of_clouds(counts: Sequence[int], count: int, seeds: Sequence[int]) -> tuple[Tensor, Tensor]:
     """Return words (T, 3, count) of draws on the CPU, as of :func:`words_drawn`, and which each cloud takes, (B,).
 
@@ -66,14 +79,9 @@ def words_of_clouds(counts: Sequence[int], count: int, seeds: Sequence[int]) -> 
         count: of draws.
         seeds: one for each cloud.
     """
-    number: dict[int, int] = {}
-    which = [number.setdefault(seed, len(number)) for seed in seeds]
-    if len(number) <= _KEPT and max(counts) < MOST_POINTS:
-        found = [words_drawn(seed, count, torch.device("cpu")) for seed in number]
-        kept = [words for words in found if words is not None]
-        if len(kept) == len(found):
-            words = kept[0][None] if len(kept) == 1 else torch.stack(kept)
-            return words, torch.from_numpy(np.array(which, np.int64))
+    shared = _words_of_any(count, tuple(seeds)) if max(counts) < MOST_POINTS else None
+    if shared is not None:
+        return shared
     draws: dict[tuple[int, int], int] = {}
     which = [draws.setdefault(draw, len(draws)) for draw in zip(counts, seeds)]
     words = torch.stack([torch.stack(_numbers_of_rows(size, 3, count, seeded(seed))) for size, seed in draws])

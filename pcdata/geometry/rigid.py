@@ -106,7 +106,7 @@ def are_few_and_rigid(matrices: Tensor, *, tolerance: float) -> bool:
 
     False may also mean that it takes a closer look.
     """
-    if len(matrices) > _FEW or not _is_plain(matrices):
+    if matrices.shape[0] > _FEW or not _is_plain(matrices):
         return False
     # Entries of R R^T and of R^T R are off those of the identity by at most three times as much as each other.
     limit = tolerance / 3

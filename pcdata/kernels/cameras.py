@@ -28,7 +28,7 @@ def images_fit(
     images: Mapping[str, Tensor],
 ) -> bool:
     """Whether a kernel may read as many cameras and pixels as there are depths: the callers are not all checked."""
-    views = len(depth)
+    views = depth.shape[0]
     cameras = intrinsics.shape == (views, 3, 3) and (distortion is None or len(distortion) == views)
     rgb = colors is None or (colors.shape == (*depth.shape, 3) and colors.dtype is torch.uint8)
     return cameras and rgb and all(image.shape[:3] == depth.shape for image in images.values())
@@ -37,7 +37,7 @@ def images_fit(
 def region_fits(depth: Tensor, matrix: Tensor | None, mask: Tensor | None) -> bool:
     """Whether a kernel may read a motion (V, 4, 4) and a mask (V, H, W) of each view."""
     return (mask is None or (mask.shape == depth.shape and mask.dtype is torch.bool)) and (
-        matrix is None or matrix.shape == (len(depth), 4, 4)
+        matrix is None or matrix.shape == (depth.shape[0], 4, 4)
     )
 
 

@@ -124,7 +124,7 @@ class CloudBatch(Structure):
     @property
     def num_clouds(self) -> int:
         """The number of clouds B."""
-        return len(self.source_from_cloud)
+        return self.source_from_cloud.shape[0]
 
     def __len__(self) -> int:
         return self.num_clouds

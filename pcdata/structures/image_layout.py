@@ -63,12 +63,12 @@ def seen_through_pinhole(
 def within_image(source_index: Tensor, ptr: Tensor, size: tuple[int, int]) -> Tensor:
     """Number pixels within their own image. Rows are in pixel order, so a cloud's last one tells whether they are."""
     num_pixels, rises = size[0] * size[1], pixels_rise(size)
-    if source_index.device.type == "cpu":  # elsewhere reading them would wait for the device
+    if is_known(rises, source_index, ptr):
+        return source_index
+    if source_index.is_cpu:  # elsewhere reading them would wait for the device
         rows = source_index.numpy()
         if all(rows[stop - 1] < num_pixels for start, stop in pairwise(ptr.tolist()) if stop > start):
             return source_index
-    elif is_known(rises, source_index, ptr):
-        return source_index
     within = source_index % num_pixels
     if is_known(pixels_of_views(size), source_index, ptr):
         note(rises, within, ptr)

@@ -140,7 +140,7 @@ class PointCloud(CloudBatch):
     @property
     def num_points(self) -> int:
         """The number of points N of all clouds together."""
-        return len(self.points)
+        return self.points.shape[0]
 
     @property
     def counts(self) -> Tensor:

@@ -145,7 +145,7 @@ class Compose(Transform):
     def _enter(self, data: Data, generator: GeneratorLike | None) -> tuple[int, GeneratorLike | None]:
         """Return the first step to run, and the generator or one for each cloud."""
         # A chain of images alone has no place for a cloud: its first step says so.
-        position = len(self.steps) - len(self._steps_for(data))
+        position = self._first_step(data)
         if self._last_random < position:
             return position, None
         generator = self._generator(generator)
@@ -156,9 +156,10 @@ class Compose(Transform):
     # -- running again ---------------------------------------------------------------------------------------------
 
     def _steps_for(self, data: Data) -> list[Transform]:
-        return list(self.steps)[
-            self._captures if isinstance(data, PointCloud) and issubclass(self.gives, PointCloud) else 0 :
-        ]
+        return list(self.steps)[self._first_step(data) :]
+
+    def _first_step(self, data: Data) -> int:
+        return self._captures if isinstance(data, PointCloud) and issubclass(self.gives, PointCloud) else 0
 
     def find_decision(self, entries: Sequence[Entry], stop: int) -> tuple[Decision, int] | None:
         """Return what the steps decided, if their entries end one after another at ``stop``."""

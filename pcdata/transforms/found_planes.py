@@ -130,7 +130,7 @@ def plane_facts(
 
 def _places(points: Tensor, corners: Tensor) -> NDArray[np.floating]:  # (B, C, 3)
     """Return where the corners are; anything where there is none."""
-    if not len(points):
+    if not points.shape[0]:
         return np.zeros((*corners.shape, 3))
     if points.device.type == "cpu":
         return points.numpy()[corners.numpy()]

@@ -151,7 +151,7 @@ def _run(
     cloud = step.recorded_counts(cloud, before, after, params, rows=step.told_rows(cloud, params))
     index = params["index"]
     may_wait = may_wait and index.dtype is torch.bool and is_known(FINITE, cloud.points)
-    if may_wait and _decides_within(behind, sum(after) / max(1, len(index))):
+    if may_wait and _decides_within(behind, sum(after) / max(1, index.shape[0])):
         return step.with_facts(cloud, cloud, params), params
     cloud = step.transform(cloud, params)
     note(UNSHARED, cloud.points)

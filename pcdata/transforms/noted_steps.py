@@ -11,6 +11,8 @@ from torch import Tensor
 
 from pcdata.transforms.decisions import DERIVED, LISTS, PER_ROW, TOLD_ROWS
 
+_UNTOLD = frozenset((*PER_ROW, *LISTS, *DERIVED, TOLD_ROWS))
+
 Values = NDArray[Any] | Tensor  # of params: on another device they are read when they are asked for
 
 
@@ -70,9 +72,9 @@ def read_in_histories(params: Mapping[str, Tensor], num: int) -> dict[str, Value
     kept: dict[str, Values] = {}
     for name, value in params.items():
         # By name, not by shape alone: with one point per cloud the shapes are the same.
-        is_per_cloud = name not in (*PER_ROW, *LISTS, *DERIVED, TOLD_ROWS)
+        is_per_cloud = name not in _UNTOLD
         if is_per_cloud and isinstance(value, Tensor) and value.shape[:1] == (num,) and value.numel() <= 16 * num:
-            kept[name] = value.detach().numpy() if value.device.type == "cpu" else value.detach()
+            kept[name] = value.detach().numpy() if value.is_cpu else value.detach()
     return kept
 
 

@@ -248,7 +248,6 @@ class RemovePlane(RemoveTransform):
         side = ((x * plane[0] + y * plane[1]) + z * plane[2]) + plane[3]
         return "neither side" if abs(side) < self.distance else "sensor"
 
-    @torch_on_one_thread()
     def with_facts(self, result: PointCloud, data: PointCloud, params: Params) -> PointCloud:
         """Store the planes in the source frame."""
         return result.with_meta(self._entries(data, params))

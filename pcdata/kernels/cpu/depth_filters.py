@@ -11,7 +11,7 @@ from pcdata.functional.depth.disparity import smallest_edge
 from pcdata.functional.depth.holes import RULES
 from pcdata.functional.depth.temporal import PERSISTENCE_RULES
 from pcdata.functional.depth.window_filters import depth_scale, pixel_shares
-from pcdata.kernels.cpu.native import call, room
+from pcdata.kernels.cpu.native import answers, call, room
 
 # The core numbers pixels with 31 bits, and those of a border of one pixel around the images too.
 _MAX_PIXELS = 2**31 - 1
@@ -110,10 +110,10 @@ def filled_confidence(
     before: Tensor, after: Tensor, confidence: Tensor | None, hallucinated: Tensor | None
 ) -> Tensor | None:
     """Look at every pixel once."""
-    found, any_filled = room(before.shape, torch.uint8), room(1, torch.int64)
+    found, any_filled = room(before.shape, torch.uint8), answers()
     marks = (None if image is None else image.contiguous() for image in (confidence, hallucinated))
     call("pc_filled_confidence", before.contiguous(), after.contiguous(), before.numel(), *marks, found, any_filled)
-    return None if confidence is None and not any_filled else found
+    return None if confidence is None and not any_filled[0] else found
 
 
 def _too_many(depth: Tensor) -> bool:

@@ -9,7 +9,7 @@ from pcdata.contracts.dispatch import OPERATIONS, kernel
 from pcdata.functional.depth.depth_to_color import RegisteredDepth, check_cameras, half_pixels
 from pcdata.geometry.lens import plain_lenses
 from pcdata.kernels.cameras import rays_of_cameras
-from pcdata.kernels.cpu.native import call, room, room_for
+from pcdata.kernels.cpu.native import answers, call, room_for
 
 # The core numbers the pixels of an image with 32 bits.
 _MOST_PIXELS = 2**32 - 1
@@ -40,7 +40,7 @@ def register_depth(
             (color_shape, torch.bool),
             (depth.shape, torch.bool),
         )
-        possible = room(1, torch.int64)
+        possible = answers()
         call(
             "pc_register_depth",
             *(depth.contiguous(), views, height, width, *rays),
@@ -49,7 +49,7 @@ def register_depth(
             lenses,
             *(*color_size, float(max_jump), *results, possible),
         )
-        if possible:
+        if possible[0]:
             return RegisteredDepth(*results)
     reference: RegisteredDepth = OPERATIONS["register_depth"].reference(
         depth,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Sequence
 
 import numpy as np
@@ -16,7 +17,7 @@ from pcdata.functional.tsdf.grid import VoxelGrid
 from pcdata.functional.tsdf.surface import Crossings
 from pcdata.functional.tsdf.views import FusionView, refuse_labels
 from pcdata.geometry.lens_models import is_plain
-from pcdata.kernels.cpu.native import address, call, numbers, room, room_for
+from pcdata.kernels.cpu.native import Numbers, answers, call, numbers, room, room_for
 
 _FEWEST_SLOTS = 1 << 12  # of a table of rows
 _MOST_PIXELS = 2**31 - 1  # of an image: the core numbers them with an int32
@@ -30,14 +31,14 @@ def touched_blocks(view: FusionView, grid: VoxelGrid) -> Tensor:
     height, width = view.depth.shape
     offsets = integrate.band(grid)
     found = room(height * width * len(offsets), torch.int64)  # what is not written never becomes memory
-    count = room(1, torch.int64)
+    count = answers()
     turn, fraction, camera = integrate.camera_in_blocks(view, grid)
     images = (view.depth.contiguous(), view.rays.contiguous(), height, width)
     call("pc_tsdf_touched", *images, turn, fraction, camera, offsets, len(offsets), found, count)
-    if count < 0:
+    if count[0] < 0:
         keys: Tensor = OPERATIONS["touched_blocks"].reference(view, grid)  # knows what to say
         return keys
-    return torch.from_numpy(found[: int(count)].numpy().copy())
+    return torch.from_numpy(found[: count[0]].numpy().copy())
 
 
 @kernel("locate_views", "cpu")
@@ -62,11 +63,11 @@ def find_blocks(blocks: VoxelBlocks, keys: Tensor) -> tuple[Tensor, Tensor]:
     if blocks.table is None or 2 * len(blocks) > len(blocks.table):
         slots = blocks.table_size(_FEWEST_SLOTS)
         blocks.table, blocks.in_table = torch.from_numpy(np.full(slots, -1, np.int32)), 0
-    rows, missing, count = room(keys.shape, torch.int64), room(keys.shape, torch.int64), room(1, torch.int64)
+    rows, missing, count = room(keys.shape, torch.int64), room(keys.shape, torch.int64), answers()
     table = (blocks.keys, len(blocks), blocks.table, len(blocks.table), blocks.in_table)
     call("pc_tsdf_find", *table, keys, len(keys), rows, missing, count)
     blocks.in_table = len(blocks)
-    return rows, missing[: int(count)]
+    return rows, missing[: count[0]]
 
 
 @kernel("integrate_view", "cpu")
@@ -108,11 +109,11 @@ def find_crossings(blocks: VoxelBlocks, grid: VoxelGrid, *, min_weight: int, edg
     count = len(blocks)
     planes, kept = plane_addresses(blocks)
     field = (blocks.sorted_keys, blocks.sorted_rows, count, planes)
-    counts, dropped = room(count, torch.int64), room(1, torch.int64)
+    counts, dropped = room(count, torch.int64), answers()
     (marks,) = room_for(((count, _MARKS), torch.int64))
     call("pc_tsdf_count_crossings", *field, min(min_weight - 1, MAX_WEIGHT), counts, marks, dropped)
     starts = ptr_from_counts(counts)
-    found = _room_for_crossings(int(starts[-1]), int(dropped), blocks, edges)
+    found = _room_for_crossings(int(starts[-1]), dropped[0], blocks, edges)
     columns = (found.points, found.normals, found.weight, found.views, found.colors, found.labels)
     edge = found.edge if edges else None
     call("pc_tsdf_write_crossings", *field, marks, starts, grid.voxel_size, edge, *columns)
@@ -164,13 +165,12 @@ def find_triangles(blocks: VoxelBlocks, edge: Tensor, *, min_weight: int) -> tup
     return is_used.nonzero().squeeze(1), triangles
 
 
-def plane_addresses(blocks: VoxelBlocks) -> tuple[Tensor, list[Tensor]]:
+def plane_addresses(blocks: VoxelBlocks) -> tuple[Numbers, list[Numbers]]:
     """Return the core's table of planes, (6,) addresses of arrays of chunk addresses, and what keeps these alive."""
-    kept = []
-    table = torch.zeros(len(_PLANES), dtype=torch.int64, device="cpu")
+    kept, table = [], answers(len(_PLANES))
     for place, name in enumerate(_PLANES):
         if blocks.chunks and name in blocks.planes:
             # Views: the core knows the layout of a chunk.
             kept.append(numbers(chunk[name].data_ptr() for chunk in blocks.chunks))
-            table[place] = address(kept[-1])
+            table[place] = ctypes.addressof(kept[-1])
     return table, kept

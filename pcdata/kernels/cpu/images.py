@@ -6,12 +6,14 @@ and all that goes along with them, where they belong.
 
 from __future__ import annotations
 
+import ctypes
 import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -20,7 +22,7 @@ from pcdata.contracts.dispatch import INNER, OPERATIONS, kernel
 from pcdata.functional.depth.deproject import Deprojected, check_intrinsics
 from pcdata.functional.depth.looks import DepthLook
 from pcdata.kernels.cameras import Rays, depth_limits, images_fit, rays_of_cameras, region_fits
-from pcdata.kernels.cpu.native import addresses, call, numbers, room, room_for
+from pcdata.kernels.cpu.native import addresses, answers, call, numbers, room, room_for
 
 
 @kernel("mask_depth", "cpu")
@@ -40,10 +42,10 @@ def look_at_depth(depth: Tensor, before: Tensor | None = None, copy: Tensor | No
     for other in (before, copy):
         if other is not None and (other.shape != depth.shape or other.dtype is not torch.float32):
             raise ValueError(f"look_at_depth: {tuple(other.shape)} {other.dtype} beside {tuple(depth.shape)}")
-    extremes, same = room(2, torch.float32), room(1, torch.int64)
+    extremes, same = answers(2, ctypes.c_float), answers()
     call("pc_look_at_depth", depth.contiguous(), depth.numel(), _contiguous(before), copy, extremes, same)
-    least, largest = extremes.tolist()
-    return DepthLook(least, largest, bool(same.item()))
+    least, largest = extremes
+    return DepthLook(least, largest, bool(same[0]))
 
 
 @kernel("deproject_depth", "cpu")
@@ -146,7 +148,7 @@ class _Cameras:
             return None
         depth, mask, (views, height, width) = self.depth, _contiguous(mask), self.depth.shape
         keep = room(depth.shape, torch.bool)
-        readings, possible = room(views, torch.int64), room(1, torch.int64)
+        readings, possible = room(views, torch.int64), answers()
         starts = room(views * height + 1, torch.int64)
         if flying is not None:  # with nothing to do before the next call, for which the core's threads stay awake
             tolerance, min_neighbors = flying
@@ -160,7 +162,7 @@ class _Cameras:
             *(*limits, mask, matrix, lower, upper),
             *(keep, readings, starts, possible),
         )
-        return _Chosen(depth, keep, readings, starts) if possible else None
+        return _Chosen(depth, keep, readings, starts) if possible[0] else None
 
     def deproject(
         self,
@@ -192,9 +194,8 @@ class _Cameras:
             *(chosen.depth, views, height, width, *self.rays, matrix, chosen.keep, chosen.starts),
             *(points, pixel_index, over_all_views, _contiguous(colors), rgb, *copying),
         )
-        return Deprojected(
-            points, numbers(bounds), pixel_index, None if colors is None else rgb, dict(zip(sources, rows))
-        )
+        ptr = torch.from_numpy(np.array(bounds, np.int64))
+        return Deprojected(points, ptr, pixel_index, None if colors is None else rgb, dict(zip(sources, rows)))
 
 
 @functools.lru_cache(maxsize=64)

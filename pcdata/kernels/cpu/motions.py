@@ -7,7 +7,7 @@ from torch import Tensor
 
 import pcdata.functional.motions  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, kernel
-from pcdata.kernels.cpu.native import call, room
+from pcdata.kernels.cpu.native import answers, call, room
 
 
 @kernel("draw_motions", "cpu")
@@ -23,9 +23,9 @@ def draw_motions(keys: Tensor, draws: Tensor, num_steps: int) -> Tensor:
 def led_back(source_from_cloud: Tensor, matrices: Tensor) -> Tensor:
     """Invert one matrix after another; LU, where it is called for, is torch's."""
     steps, clouds = matrices.shape[:2]
-    result, possible = room(source_from_cloud.shape, torch.float64), room(1, torch.int64)
+    result, possible = room(source_from_cloud.shape, torch.float64), answers()
     call("pc_led_back", matrices.contiguous(), steps, clouds, source_from_cloud.contiguous(), result, possible)
-    if not possible:
+    if not possible[0]:
         back: Tensor = INNER["led_back"].reference(source_from_cloud, matrices)
         return back
     return result
@@ -34,6 +34,6 @@ def led_back(source_from_cloud: Tensor, matrices: Tensor) -> Tensor:
 @kernel("are_plain_motions", "cpu")
 def are_plain_motions(matrices: Tensor) -> bool:
     """Look at one after another."""
-    plain = room(1, torch.int64)
+    plain = answers()
     call("pc_are_plain_motions", matrices.contiguous(), matrices.numel() // 16, plain)
-    return bool(plain)
+    return bool(plain[0])

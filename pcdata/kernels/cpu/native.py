@@ -15,7 +15,6 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -42,26 +41,33 @@ class _Context(ctypes.Structure):
     _fields_ = [("threads", ctypes.c_int32), ("poll", _Poll)]
 
 
-# The dtypes of tensors for a pointer of each type; True and False are bytes too.
-_DTYPES = {
-    "float*": (torch.float32,),
-    "double*": (torch.float64,),
-    "bool*": (torch.bool,),
-    "uint8*": (torch.uint8, torch.bool),
-    "int32*": (torch.int32,),
-    "int64*": (torch.int64,),
-}
 _NUMBERS = {"int64": ctypes.c_int64, "double": ctypes.c_double}
+# What a pointer of each type may point to: the dtypes of tensors, of which True and False are bytes too, and the type
+# of a few numbers of Python's own.
+_POINTED = {
+    "float*": ((torch.float32,), ctypes.c_float),
+    "double*": ((torch.float64,), ctypes.c_double),
+    "bool*": ((torch.bool,), None),
+    "uint8*": ((torch.uint8, torch.bool), None),
+    "int32*": ((torch.int32,), None),
+    "int64*": ((torch.int64,), ctypes.c_int64),
+}
+
+# A few numbers that the core reads or writes: these cost a fraction of a tensor, to make and to read.
+Numbers = ctypes.Array[Any]
 
 
-class _Parameter(NamedTuple):
+class _Pointer(NamedTuple):
+    place: int  # among the arguments
     name: str
-    dtypes: tuple[torch.dtype, ...]  # that a tensor may have; none: a number
+    dtypes: tuple[torch.dtype, ...]
+    numbers: type[Any] | None
 
 
 class _Function(NamedTuple):
     entry: Any  # of ctypes, with the types of its arguments
-    parameters: tuple[_Parameter, ...]
+    num_arguments: int
+    pointers: tuple[_Pointer, ...]  # those of them that are no numbers
 
 
 Library = dict[str, _Function]  # the functions by their names
@@ -122,12 +128,13 @@ def load(path: Path) -> Library:
         arguments = [argument.split() for argument in declared.split(", ")]
         entry = getattr(compiled, name)
         entry.argtypes = [ctypes.c_void_p, *(_NUMBERS.get(kind, ctypes.c_void_p) for kind, _ in arguments)]
-        functions[name] = _Function(entry, tuple(_Parameter(at, _DTYPES.get(kind, ())) for kind, at in arguments))
+        pointers = [(place, at, *_POINTED[kind]) for place, (kind, at) in enumerate(arguments) if kind in _POINTED]
+        functions[name] = _Function(entry, len(arguments), tuple(map(_Pointer._make, pointers)))
     return functions
 
 
 def call(function: str, *arguments: Any) -> None:
-    """Call ``function(context, *arguments)``; tensors go as pointers, numbers as the core declares them.
+    """Call ``function(context, *arguments)``; tensors and arrays go as pointers, numbers as the core declares them.
 
     None goes as the null pointer and means "not given". No tensor does, not even an empty one, whose own pointer is
     null: the core may tell the two apart.
@@ -139,8 +146,10 @@ def call(function: str, *arguments: Any) -> None:
         BackendError: there are more rows than it can number.
         KeyboardInterrupt: Ctrl-C (or whatever a signal handler raised) while it ran.
     """
-    entry, parameters = library()[function]
-    values = _values(function, parameters, arguments)
+    entry, num_arguments, pointers = library()[function]
+    if len(arguments) != num_arguments:
+        raise TypeError(f"{function} takes {num_arguments} arguments, got {len(arguments)}; please report this")
+    values = _values(function, pointers, arguments)
     idle = _idle.callers
     caller = idle.pop() if idle else _Caller()
     caller.context.threads = core_threads()
@@ -202,12 +211,18 @@ def room(shape: int | Sequence[int], dtype: torch.dtype) -> Tensor:
     return torch.empty(shape, dtype=dtype, device=_CPU)
 
 
-def numbers(values: Iterable[int]) -> Tensor:
+def numbers(values: Iterable[int]) -> Numbers:
     """Return whole numbers as the core reads them, int64."""
-    return torch.from_numpy(np.array([*values], np.int64))  # in a third of the time of torch.tensor
+    given = [*values]
+    return (ctypes.c_int64 * len(given))(*given)
 
 
-def addresses(tensors: Iterable[Tensor]) -> Tensor:
+def answers(count: int = 1, kind: type[Any] = ctypes.c_int64) -> Numbers:
+    """Return zeros for the core to write a few numbers over."""
+    return (kind * count)()
+
+
+def addresses(tensors: Iterable[Tensor]) -> Numbers:
     """Return where the tensors lie in memory, for functions that take any number of them; keep them alive meanwhile."""
     return numbers(_pointers(tensors))
 
@@ -215,11 +230,6 @@ def addresses(tensors: Iterable[Tensor]) -> Tensor:
 # Where an empty tensor "lies": no tensor may look like one that was not given, and nothing is read or written here.
 _EMPTY = ctypes.create_string_buffer(64)
 _NOWHERE = ctypes.addressof(_EMPTY)
-
-
-def address(tensor: Tensor) -> int:
-    """Return where a tensor lies in memory, never 0; keep it alive meanwhile."""
-    return _pointers([tensor])[0]
 
 
 def _pointers(tensors: Iterable[Tensor]) -> list[int]:
@@ -280,21 +290,20 @@ def _polls(raised: list[BaseException]) -> Iterator[int]:
             stop = 1
 
 
-def _values(function: str, parameters: Sequence[_Parameter], arguments: Sequence[Any]) -> list[Any]:
-    """Return arguments as ctypes passes them, checked; in one loop, as a kernel has up to twenty."""
-    if len(arguments) != len(parameters):
-        raise TypeError(f"{function} takes {len(parameters)} arguments, got {len(arguments)}; please report this")
-    passed: list[Any] = []
-    for (name, dtypes), value in zip(parameters, arguments):
-        if not dtypes or value is None:
-            passed.append(value)
-        elif not isinstance(value, Tensor) or value.dtype not in dtypes:
+def _values(function: str, pointers: Sequence[_Pointer], arguments: Sequence[Any]) -> list[Any]:
+    """Return arguments as ctypes passes them; what it would not hold to its declaration, pointers, checked."""
+    passed = list(arguments)
+    for place, name, dtypes, kind in pointers:
+        value = passed[place]
+        if value is None:
+            continue
+        if isinstance(value, Tensor) and value.dtype in dtypes:
+            if not value.is_contiguous() or not value.is_cpu:
+                raise _astray(value)
+            passed[place] = value.data_ptr() or _NOWHERE
+        elif not isinstance(value, ctypes.Array) or value._type_ is not kind:
             given = value.dtype if isinstance(value, Tensor) else type(value).__name__
             raise TypeError(f"{function}: {name} takes a tensor of {dtypes[0]}, got {given}; please report this")
-        elif not value.is_contiguous() or not value.is_cpu:
-            raise _astray(value)
-        else:
-            passed.append(value.data_ptr() or _NOWHERE)
     return passed
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+
 import torch
 from torch import Tensor
 
@@ -12,7 +14,7 @@ import pcdata.functional.normals  # noqa: F401
 from pcdata.contracts.dispatch import INNER, kernel
 from pcdata.functional.image_grid import ImageGrid
 from pcdata.functional.radius import require_cells
-from pcdata.kernels.cpu.native import call, room, room_for
+from pcdata.kernels.cpu.native import answers, call, room, room_for
 from pcdata.kernels.cpu.search_arguments import core_rows, grid_arguments, limit_of, reachable
 
 
@@ -24,7 +26,7 @@ def estimate_normals(
     points, ptr = core_rows(points, ptr)
     normals = room(points.shape, points.dtype)
     most = reachable(max_neighbors, points)
-    call("pc_normals", points, ptr, len(ptr) - 1, most, limit_of(radius), *grid_arguments(grid), normals)
+    call("pc_normals", points, ptr, ptr.shape[0] - 1, most, limit_of(radius), *grid_arguments(grid), normals)
     return normals
 
 
@@ -46,7 +48,7 @@ def neighborhood_shapes(points: Tensor, index: Tensor, centers: Tensor) -> tuple
     queries, k = index.shape
     mean, covariance = room_for(((queries, 3), torch.float32), ((queries, 3, 3), torch.float64))
     counts = room(queries, torch.int64)
-    arrays = points.detach().contiguous(), len(points), index.contiguous(), queries, k, centers.contiguous()
+    arrays = points.detach().contiguous(), points.shape[0], index.contiguous(), queries, k, centers.contiguous()
     call("pc_neighborhood_shapes", *arrays, mean, covariance, counts)
     return mean, covariance, counts
 
@@ -54,9 +56,9 @@ def neighborhood_shapes(points: Tensor, index: Tensor, centers: Tensor) -> tuple
 @kernel("density_clusters", "cpu")
 def density_clusters(points: Tensor, ptr: Tensor, eps: float, min_points: int, grid: ImageGrid | None) -> Tensor:
     """Join cells that hold core points, then number the clusters and label their borders."""
-    label = room(len(points), torch.int64)
-    largest = room(1, torch.float64)
-    enough = min(min_points, len(points) + 1)
-    call("pc_dbscan", points, ptr, len(ptr) - 1, eps, enough, label, largest)
-    require_cells("dbscan", eps, largest.item())
+    label = room(points.shape[0], torch.int64)
+    largest = answers(kind=ctypes.c_double)
+    enough = min(min_points, points.shape[0] + 1)
+    call("pc_dbscan", points, ptr, ptr.shape[0] - 1, eps, enough, label, largest)
+    require_cells("dbscan", eps, largest[0])
     return label

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ctypes
+
 import torch
 from torch import Tensor
 
@@ -9,7 +11,7 @@ import pcdata.functional.outliers  # noqa: F401 - the operations must be registe
 from pcdata.contracts.dispatch import kernel
 from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.radius import require_cells
-from pcdata.kernels.cpu.native import call, room
+from pcdata.kernels.cpu.native import answers, call, room
 from pcdata.kernels.cpu.search_arguments import core_rows, grid_arguments, reachable
 
 
@@ -19,11 +21,11 @@ def statistical_outlier_mask(
 ) -> Tensor:
     """Run the reference's contract in the core."""
     points, ptr = core_rows(points, ptr)
-    mean = room(len(points), torch.float64)
-    outlier = room(len(points), torch.bool)
+    mean = room(points.shape[0], torch.float64)
+    outlier = room(points.shape[0], torch.bool)
     call(
         "pc_statistical_outliers",
-        *(points, ptr, len(ptr) - 1, reachable(num_neighbors, points), std_ratio),
+        *(points, ptr, ptr.shape[0] - 1, reachable(num_neighbors, points), std_ratio),
         *(*grid_arguments(grid), mean, outlier),
     )
     return outlier
@@ -51,13 +53,13 @@ def _radius_outliers(
     points: Tensor, ptr: Tensor, within: Tensor | None, min_neighbors: int, radius: float, grid: ImageGrid | None
 ) -> Tensor:
     points, ptr = core_rows(points, ptr)
-    outlier = room(len(points), torch.bool)
-    largest = room(1, torch.float64)
-    enough = min(min_neighbors, len(points))  # as unreachable as any larger number, and fits an int64
+    outlier = room(points.shape[0], torch.bool)
+    largest = answers(kind=ctypes.c_double)
+    enough = min(min_neighbors, points.shape[0])  # as unreachable as any larger number, and fits an int64
     call(
         "pc_radius_outlier_mask",
-        *(points, ptr, len(ptr) - 1, radius, enough),
+        *(points, ptr, ptr.shape[0] - 1, radius, enough),
         *(*grid_arguments(grid)[:2], within, outlier, largest),
     )
-    require_cells("radius_outlier_mask", radius, largest.item())
+    require_cells("radius_outlier_mask", radius, largest[0])
     return outlier

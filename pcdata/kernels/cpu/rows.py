@@ -17,7 +17,7 @@ from torch import Tensor
 import pcdata.geometry.rigid  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import INNER, kernel
 from pcdata.functional.rows import KeptRows
-from pcdata.kernels.cpu.native import addresses, call, numbers, room, room_for
+from pcdata.kernels.cpu.native import Numbers, addresses, answers, call, numbers, room, room_for
 
 _MANY_ROWS = 300_000  # of all fields: some megabytes, which are worth a look at every part
 
@@ -41,7 +41,7 @@ def pick_rows(
     num_rows = len(sources[0]) if sources and sources[0].ndim else 0
     if num_rows == 0 or rows.ndim != 1 or not _are_plain(sources, num_rows):
         return _reference("pick_rows", fields, rows, in_place=in_place)
-    if rows.dtype is torch.bool and len(rows) == num_rows:
+    if rows.dtype is torch.bool and rows.shape[0] == num_rows:
         if not in_place:
             return dict(zip(fields, _keep_rows(sources, rows.contiguous(), count)))
         if all(source.is_contiguous() for source in sources):
@@ -55,33 +55,31 @@ def pick_rows(
 
 def _keep_rows(fields: Sequence[Tensor], mask: Tensor, count: int | None) -> list[Tensor]:
     """Return the rows of a mask; a count that turns out to be wrong does no harm."""
-    kept, rows = room(1, torch.int64), mask.shape[0]
+    kept, rows = answers(), mask.shape[0]
     if count is None:
         call("pc_keep_rows", mask, rows, -1, 0, numbers(()), numbers(()), numbers(()), kept)
-        count = int(kept.item())
+        count = kept[0]
     sources, picked, sizes = _sources_and_picked(fields, count)
     call("pc_keep_rows", mask, rows, count, len(fields), addresses(sources), sizes, addresses(picked), kept)
-    found = int(kept.item())
-    return picked if found == count else _keep_rows(fields, mask, found)
+    return picked if kept[0] == count else _keep_rows(fields, mask, kept[0])
 
 
 def _keep_rows_in_place(fields: Sequence[Tensor], mask: Tensor) -> list[Tensor]:
-    kept, where, sizes = room(1, torch.int64), addresses(fields), numbers(map(_row_bytes, fields))
-    call("pc_keep_rows", mask, len(mask), len(mask), len(fields), where, sizes, where, kept)
-    count = int(kept)
-    return [field[:count] for field in fields]
+    kept, where, sizes = answers(), addresses(fields), numbers(map(_row_bytes, fields))
+    call("pc_keep_rows", mask, mask.shape[0], mask.shape[0], len(fields), where, sizes, where, kept)
+    return [field[: kept[0]] for field in fields]
 
 
 def _take_rows(fields: Sequence[Tensor], index: Tensor) -> list[Tensor] | None:
     """Return the rows of all fields; None if an index is negative, which counts from the end, or out of range."""
-    sources, picked, sizes = _sources_and_picked(fields, len(index))
-    possible = room(1, torch.int64)
+    sources, picked, sizes = _sources_and_picked(fields, index.shape[0])
+    possible = answers()
     of_all = len(fields), addresses(sources), sizes, addresses(picked)
-    call("pc_take_rows", index, len(index), len(fields[0]), *of_all, possible)
-    return picked if possible else None
+    call("pc_take_rows", index, index.shape[0], len(fields[0]), *of_all, possible)
+    return picked if possible[0] else None
 
 
-def _sources_and_picked(fields: Sequence[Tensor], count: int) -> tuple[list[Tensor], list[Tensor], Tensor]:
+def _sources_and_picked(fields: Sequence[Tensor], count: int) -> tuple[list[Tensor], list[Tensor], Numbers]:
     """Return the fields without gaps, room for ``count`` rows of each, and the bytes of a row of each."""
     sources = [field.contiguous() for field in fields]
     picked = room_for(*[((count, *field.shape[1:]), field.dtype) for field in fields])
@@ -157,28 +155,28 @@ def _placed(
 @kernel("transform_points", "cpu")
 def transform_points(points: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
     """Move every point once, through registers."""
-    if not _covers(points, ptr) or matrix.shape != (len(ptr) - 1, 4, 4):
+    if not _covers(points, ptr) or matrix.shape != (ptr.shape[0] - 1, 4, 4):
         return _reference("transform_points", points, ptr, matrix)
     (moved,) = room_for((points.shape, points.dtype))
-    call("pc_transform_points", points.contiguous(), ptr.contiguous(), len(ptr) - 1, _wide(matrix), moved)
+    call("pc_transform_points", points.contiguous(), ptr.contiguous(), ptr.shape[0] - 1, _wide(matrix), moved)
     return moved
 
 
 @kernel("transform_directions", "cpu")
 def transform_directions(directions: Tensor, ptr: Tensor, matrix: Tensor) -> Tensor:
     """Turn every direction once, through registers."""
-    if not _covers(directions, ptr) or matrix.shape != (len(ptr) - 1, 4, 4):
+    if not _covers(directions, ptr) or matrix.shape != (ptr.shape[0] - 1, 4, 4):
         return _reference("transform_directions", directions, ptr, matrix)
     (turned,) = room_for((directions.shape, directions.dtype))
     linear = torch.linalg.inv(_wide(matrix)[:, :3, :3]).mT.contiguous()
-    call("pc_transform_directions", directions.contiguous(), ptr.contiguous(), len(ptr) - 1, linear, turned)
+    call("pc_transform_directions", directions.contiguous(), ptr.contiguous(), ptr.shape[0] - 1, linear, turned)
     return turned
 
 
 def _covers(points: Tensor, ptr: Tensor) -> bool:
     """Whether these are float32 points that the row pointers cut completely."""
-    fits = points.dtype is torch.float32 and points.shape[1:] == (3,) and ptr.dtype is torch.int64 and len(ptr) > 1
-    return fits and int(ptr[0]) == 0 and int(ptr[-1]) == len(points)
+    fits = points.dtype is torch.float32 and points.shape[1:] == (3,) and ptr.dtype is torch.int64 and ptr.shape[0] > 1
+    return fits and int(ptr[0]) == 0 and int(ptr[-1]) == points.shape[0]
 
 
 def _wide(matrix: Tensor) -> Tensor:
@@ -190,10 +188,10 @@ def inside_box(points: Tensor, lower: Sequence[float], upper: Sequence[float]) -
     """Look at every point once."""
     if points.dtype is not torch.float32:
         return _reference("inside_box", points, lower, upper)
-    inside, finite = room(len(points), torch.bool), room(1, torch.int64)
+    inside, finite = room(points.shape[0], torch.bool), answers()
     corners = points.new_tensor(lower), points.new_tensor(upper)
-    call("pc_inside_box", points.contiguous(), len(points), *corners, inside, finite)
-    return inside if finite else None
+    call("pc_inside_box", points.contiguous(), points.shape[0], *corners, inside, finite)
+    return inside if finite[0] else None
 
 
 def _reference(function: str, *args: Any, **options: Any) -> Any:

@@ -21,13 +21,13 @@ def core_rows(points: Tensor, ptr: Tensor) -> tuple[Tensor, Tensor]:
         ValueError: there are more points than it can number.
     """
     if points.shape[0] > MAX_ROWS:
-        raise ValueError(f"the compiled core takes at most {MAX_ROWS} points in a call, got {len(points)}")
+        raise ValueError(f"the compiled core takes at most {MAX_ROWS} points in a call, got {points.shape[0]}")
     return (points.detach() if points.requires_grad else points).contiguous(), ptr.contiguous()
 
 
 def reachable(count: int, points: Tensor) -> int:
     """Return a number of neighbors that gives the same answer and fits the 31 bits of the core."""
-    return min(count, max(1, len(points)))
+    return min(count, max(1, points.shape[0]))
 
 
 @functools.lru_cache(maxsize=256)

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import OPERATIONS, kernel
 from pcdata.functional.selection import require_box
-from pcdata.kernels.cpu.native import call, room
+from pcdata.kernels.cpu.native import answers, call, room
 
 # The core numbers the rows of one cloud with 31 bits.
 _MAX_ROWS = 2**31 - 1
@@ -45,6 +45,6 @@ def duplicate_mask(*, points: Tensor, ptr: Tensor) -> Tensor:
 @kernel("hull_rows", "cpu")
 def hull_rows(points: Tensor) -> Tensor:
     """Divide edges like the reference, with one pass over the points outside of each."""
-    corners, number = room(len(points), torch.int64), room(1, torch.int64)
+    corners, number = room(len(points), torch.int64), answers()
     call("pc_convex_hull", points.contiguous(), len(points), corners, number)
-    return corners[: int(number)].clone()
+    return corners[: number[0]].clone()

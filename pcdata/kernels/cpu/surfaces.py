@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 from itertools import pairwise
 
 import torch
@@ -19,7 +20,7 @@ from pcdata.functional.surface_fit import (
     SurfaceFit,
     require_table,
 )
-from pcdata.kernels.cpu.native import call, room
+from pcdata.kernels.cpu.native import answers, call, room
 
 
 @kernel("reaches", "cpu")
@@ -40,9 +41,9 @@ def fit_surface(points: Tensor, reach: Tensor, plane: Tensor, distance: float, w
     """Fit without a pass through memory for every term; sums are added in eight lanes, whatever the processor."""
     step = max(1, -(-len(points) // SAMPLE))
     numbers = torch.tensor([distance, step, ROUNDS, OWN, *BESIDE, MAD, LEAST_NOISE], dtype=torch.float64, device="cpu")
-    height, found = room(len(points), torch.float64), room(4, torch.float64)
+    height, found = room(len(points), torch.float64), answers(4, ctypes.c_double)
     given = points.contiguous(), len(points), reach.contiguous(), plane.contiguous(), plane_axes(plane).contiguous()
     call("pc_fit_surface", *given, numbers, height, found)
-    noise, typical, clutter, num_near = found.tolist()
+    noise, typical, clutter, num_near = found
     require_table(where, int(num_near), distance)
     return SurfaceFit(height, noise, typical, clutter)
