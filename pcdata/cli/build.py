@@ -14,7 +14,7 @@ from pcdata.cli.options import add_capture_options, given_options, skip_list
 from pcdata.cli.progress_bar import ProgressBar
 
 if TYPE_CHECKING:
-    from pcdata.build import BuildConfig
+    from pcdata.build import BuildConfig, BuildReport
 
 _SHOWN = 20  # of what lies beside the captures and is not read
 QUARANTINED = 3  # exit code: the dataset is there, but some captures are not in it
@@ -163,11 +163,26 @@ def _build(arguments: argparse.Namespace) -> int:
         print(f"\ndataset  {report.folder}{loads}")
         if not isinstance(report.folder, Path) and not is_read_at_urls(config.output.format):
             print(f"         {config.output.format} is read from a copy on the disk; webdataset also where it is")
-        for note in notes_of(config, report):
+        path = arguments.source or str(getattr(source, "path", "SOURCE"))
+        for note in [*notes_of(config, report), *_pose_notes(config, source, report, path)]:
             print(f"note     {note}")
         if report.quarantined and isinstance(report.folder, Path):
             print("         once the cause is mended, the same command with --retry-quarantined tries those again")
     return QUARANTINED if report.quarantined and arguments.max_bad is None else 0
+
+
+def _pose_notes(config: BuildConfig, source: Any, report: BuildReport, path: str) -> list[str]:
+    """Say that clouds lie elsewhere than they should, where a step put them where the poses of their captures say."""
+    from pcdata.transforms import FuseTSDF, ToFrame
+    from pcdata.validation.pose_look import pose_warning
+
+    by_pose = [
+        isinstance(step, FuseTSDF) or (isinstance(step, ToFrame) and step.matrix is None)
+        for step in config.pipeline.parts()
+    ]
+    # Only what a worker has loaded: a capture may hang, or end the process that reads it.
+    told = pose_warning(source, [sample.id for sample in report.samples], path) if any(by_pose) else None
+    return [] if told is None else [told]
 
 
 def _config(arguments: argparse.Namespace) -> BuildConfig:

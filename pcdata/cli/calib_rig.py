@@ -51,28 +51,36 @@ def _overlap(arguments: argparse.Namespace) -> int | None:
     from pcdata.files.strict_json import json_text
     from pcdata.report.overlap_figure import save_overlap_figure
     from pcdata.validation import verify_overlap
+    from pcdata.validation.pose_look import wrong_poses
     from pcdata.verdicts import Verdict, worst
 
     captures = _load("calib overlap", arguments, arguments.calibration)
     with text_files("overlap", json=arguments.json) as write:
         stands = _stands(captures)
         results = [verify_overlap(*stand, names=_names(stand[0])) for stand in stands]
-        verdict = worst(result.verdict for result in results)
+        directions = [wrong_poses(stand[:1]) for stand in stands]
+        verdict = worst([*(result.verdict for result in results), *(one.verdict for one in directions if one)])
         told = [
-            {"captures": [capture.sample_id for capture in stand], **result.to_json()}
-            for stand, result in zip(stands, results)
+            {
+                "captures": [capture.sample_id for capture in stand],
+                **result.to_json(),
+                "pose_direction": None if direction is None else direction.to_json(),
+            }
+            for stand, result, direction in zip(stands, results, directions)
         ]
         write("json", json_text({"verdict": verdict, "stands": told}, indent=2) + "\n")
-    for stand, result in zip(stands, results):
+    for stand, result, direction in zip(stands, results, directions):
         if len(stands) > 1:
             print(f"capture {', '.join(str(capture.sample_id) for capture in stand)}")
         print(result.text())
+        if direction is not None:
+            print(f"  poses: {direction.found}: {direction.verdict}\n  -> {direction.advice}")
     if len(stands) > 1:
         print(
             f"overlap: {verdict}, the worst of {len(stands)} stands: cameras moved in between, so each is judged alone"
         )
     if arguments.figure:
-        drawn = next(place for place, result in enumerate(results) if result.verdict is verdict)
+        drawn = max(range(len(results)), key=lambda place: results[place].verdict.severity)
         save_overlap_figure(arguments.figure, stands[drawn][0], results[drawn])
     return FAILED if verdict is Verdict.FAIL else None
 

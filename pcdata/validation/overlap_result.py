@@ -117,7 +117,12 @@ class OverlapResult:
                     f"{camera.name}: off by {1e3 * camera.shift:.1f} mm and {camera.rotation_degrees:.2f} degrees, "
                     "more than passes; give more captures to be sure, or let pcdata calib refine propose its pose"
                 )
-            if camera.unmeasurable:
+            if not any(pair.num_samples for pair in self.pairs if camera.name in (pair.first, pair.second)):
+                yield (
+                    f"{camera.name}: shares no surface with another camera; if it should, check its pose: that it is "
+                    "world_from_camera, in metres and its own; else let the cameras see one place together"
+                )
+            elif camera.unmeasurable:
                 yield (
                     f"{camera.name}: not measurable here: {'; '.join(camera.unmeasurable)}; put objects with upright "
                     "sides where the cameras overlap, or give several captures"

@@ -1,0 +1,89 @@
+"""Whoever makes clouds by poses is told where another convention fits better; right poses get no word."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pcdata import open_source
+from pcdata.cli import main
+from pcdata.geometry import rigid
+from pcdata.io import write_capture
+from pcdata.structures import DepthFrame
+from pcdata.synthetic import tabletop
+from pcdata.validation.pose_look import pose_warning, wrong_poses
+from pcdata.verdicts import Verdict
+
+
+def frame_of(*, wrong: tuple[int, ...] = ()) -> DepthFrame:
+    frame = tabletop(3, num_objects=4, num_views=2, size=(120, 160)).frame
+    poses = frame.world_from_camera.clone()
+    for view in wrong:
+        poses[view] = rigid.invert_rigid(poses[view])
+    return replace(frame, world_from_camera=poses)
+
+
+def test_right_poses_unposed_captures_and_clouds_get_no_word() -> None:
+    right = frame_of()
+    assert wrong_poses([right]) is None
+    assert wrong_poses([replace(right, world_from_camera=None, frame_id=None)]) is None
+    assert wrong_poses([]) is None
+
+
+@pytest.mark.parametrize("wrong", [(0, 1), (1,)])
+def test_inverted_poses_are_told(wrong: tuple[int, ...]) -> None:
+    found = wrong_poses([frame_of(wrong=wrong)])
+    assert found is not None
+    assert found.verdict is Verdict.FAIL
+    assert "camera_from_world" in found.advice
+
+
+@pytest.fixture
+def moving(tmp_path: Path) -> Path:
+    """One camera at two places, its poses written the wrong way."""
+    frame = frame_of(wrong=(0, 1))
+    write_capture(frame, tmp_path / "rig")
+    one = tmp_path / "rig" / "view0"
+    name = next((one / "depth").iterdir()).stem
+    for folder in ("depth", "color", "labels", "poses"):
+        for view, other in ((0, "a"), (1, "b")):
+            source = tmp_path / "rig" / f"view{view}" / folder
+            for file in list(source.glob(f"{name}.*")) if source.is_dir() else []:
+                (one / folder / f"{other}{file.suffix}").write_bytes(file.read_bytes())
+    for folder in ("depth", "color", "labels", "poses"):
+        for file in (one / folder).glob(f"{name}.*"):
+            file.unlink()
+    return one
+
+
+def test_the_commands_that_use_poses_say_so(moving: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = open_source(moving)
+    assert source.ids == ["a", "b"]
+    assert "camera_from_world" in (pose_warning(source, source.ids, "my captures") or "")
+    words = ["build", "--model", "dp3_sim", "--set", "crop=none", "--source", str(moving)]
+    assert main([*words, "--set", "frame=base", "--out", str(tmp_path / "set")]) == 0
+    assert "note     the poses look wrong: " in capsys.readouterr().out
+    assert main([*words, "--set", "frame=camera", "--out", str(tmp_path / "own")]) == 0
+    assert "look wrong" not in capsys.readouterr().out, "clouds that stay in the camera's frame need no pose"
+    assert main(["fuse", str(moving), "--voxel-size", "0.01", "--out", str(tmp_path / "s.ply")]) == 0
+    assert "fuse: the poses look wrong" in capsys.readouterr().err
+    # What the advice says to read it by is right.
+    right = ["--option", "convention.poses=camera_from_world"]
+    assert main([*words, "--set", "frame=base", "--out", str(tmp_path / "right"), *right]) == 0
+    assert "look wrong" not in capsys.readouterr().out
+
+
+def test_overlap_fails_a_view_whose_pose_is_inverted(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_capture(frame_of(wrong=(1,)), tmp_path / "rig")
+    assert main(["calib", "overlap", str(tmp_path / "rig")]) == 1
+    assert "camera_from_world" in capsys.readouterr().out
+    far = frame_of()
+    poses = far.world_from_camera.clone()
+    poses[1, :3, 3] += torch.from_numpy(np.array([50.0, 0.0, 0.0]))
+    write_capture(replace(far, world_from_camera=poses), tmp_path / "far")
+    main(["calib", "overlap", str(tmp_path / "far")])
+    assert "shares no surface with another camera; if it should, check its pose" in capsys.readouterr().out
