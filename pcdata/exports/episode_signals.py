@@ -84,10 +84,13 @@ def _stays(cloud: PointCloud, following: PointCloud) -> bool:
 def _numbers(where: str, what: str, name: str, values: Any, *, free: bool) -> NDArray[np.float32]:
     if not isinstance(values, Tensor) or (not free and values.ndim not in (1, 2)):
         found = "a text" if not isinstance(values, Tensor) else f"of shape {tuple(values.shape[1:])}"
-        raise CaptureError(
-            f"{where}: {what} must be a row of numbers, but the signal {name!r} is {found}; choose another, or record "
-            f"it in a row. If it is a 4x4 pose, state that when it is read: --signal {name}='pose matrix in FRAME'"
-        )
+        way = "choose another, or record it in a row (docs/signals.md)"
+        if isinstance(values, Tensor) and tuple(values.shape[1:]) == (4, 4):
+            way = (
+                "if it is a pose, say so where it is recorded: its kind is 'pose matrix' and it has a frame; of a "
+                f"recording of a robot --signal {name}='pose matrix in FRAME'"
+            )
+        raise CaptureError(f"{where}: {what} must be a row of numbers, but the signal {name!r} is {found}; {way}")
     row = values[0].to("cpu", torch.float64)
     narrow: NDArray[np.float32] = np.atleast_1d(row.numpy()).astype(np.float32)
     if not np.isfinite(narrow).all():

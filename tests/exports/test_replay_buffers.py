@@ -325,3 +325,13 @@ def test_a_wrong_layout_of_poses_is_refused_before_anything_is_written(tmp_path:
     with pytest.raises(ConfigError, match="dp3: poses: a pose is written in a row as one of"):
         export_dataset(Recording((12,), posed_step), "dp3", tmp_path / "a", state="eef", action="eef", poses="rot6d")
     assert not (tmp_path / "a").exists()
+
+
+def test_a_matrix_that_nobody_calls_a_pose_is_told_how_to_become_one(tmp_path: Path) -> None:
+    def raw(number: int) -> PointCloud:
+        made = posed_step(number).with_signal("task", ("pick",), "text")
+        return made.with_signal("raw", torch.eye(4)[None], "invariant")
+
+    for state, advice in (("raw", "its kind is 'pose matrix'"), ("task", "is a text; choose another")):
+        with pytest.raises(CaptureError, match=advice):
+            export_dataset(Recording((12,), raw), "dp3", tmp_path / state, state=state, next_state=True)

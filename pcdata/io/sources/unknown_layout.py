@@ -58,6 +58,7 @@ def unknown_layout(path: Path) -> CaptureError:
         _recording_inside,
         _robot_poses,
         _without_calibration,
+        _lerobot_without_facts,
         _images_alone,
     ):
         if told := way(path):
@@ -182,6 +183,15 @@ def _without_calibration(path: Path) -> str:
     if not any(is_folder(entry) and re.sub(r"[^a-z]", "", entry.name.lower()) == "depth" for entry in _entries(path)):
         return ""
     return f"The layout folder {_refusal('folder', path)}; then {_command(path)}"
+
+
+def _lerobot_without_facts(path: Path) -> str:
+    """Say that a LeRobot dataset lacks the file that says what is in it."""
+    if not all((path / folder).is_dir() for folder in ("meta", "data")) or (path / "meta" / "info.json").exists():
+        return ""
+    if not any((path / "data").rglob("*.parquet")):
+        return ""
+    return "meta/ and data/ are those of a LeRobot dataset, but meta/info.json is missing: copy the dataset again"
 
 
 def _images_alone(path: Path) -> str:

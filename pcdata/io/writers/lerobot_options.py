@@ -60,6 +60,8 @@ class LeRobotOptions(Writer):
             raise ConfigError(f"lerobot: fps must be steps in a second, 1 to 1000, got {fps!r:.60}")
         if self.poses != "":
             checked_pose_layout("lerobot: poses", self.poses)
+            if not self.state and not self.action:
+                raise ConfigError("lerobot: poses says how state and action write poses; give state=NAME,NAME too")
         points: Any = self.points
         if isinstance(points, bool) or not isinstance(points, int) or not 0 <= points < 1 << 24:
             raise ConfigError(f"lerobot: points must be a whole number from 0, got {points!r:.60}")

@@ -356,6 +356,15 @@ def test_poses_in_the_state_are_position_and_rotation_in_the_layout_asked_for(tm
         assert info(out)["features"]["observation.state"]["shape"] == [len(row)]
     with pytest.raises(ConfigError, match="lerobot: poses: a pose is written in a row as one of"):
         convert(MadeCaptures(frames), "lerobot", tmp_path / "bad", state="hand", poses="matrix")
+    with pytest.raises(ConfigError, match="give state=NAME,NAME too"):
+        convert(MadeCaptures(frames), "lerobot", tmp_path / "bad", poses="xyz_quat_xyzw")
+
+
+def test_a_dataset_without_its_facts_is_known_by_its_folders(tmp_path: Path) -> None:
+    convert(MadeCaptures({"0": made_frame()}), "lerobot", tmp_path / "out")
+    (tmp_path / "out" / "meta" / "info.json").unlink()
+    with pytest.raises(CaptureError, match=r"LeRobot dataset, but meta/info\.json is missing: copy the dataset again"):
+        open_source(tmp_path / "out")
 
 
 def test_one_row_of_large_arrays_is_read_without_decoding_hundreds(tmp_path: Path) -> None:
