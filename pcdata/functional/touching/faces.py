@@ -74,7 +74,8 @@ class Scene:
         near = row.clamp(0, height - 1) * width + column.clamp(0, width - 1)
         label, inverse = self.label.flatten(), self.inverse.flatten()
         apart = (offset[:, None] ** 2 + offset**2).double().sqrt() * inverse[near] / self.camera.fx
-        steep = inverse[near] - inverse[pixels][:, None, None] > self.limits.slope * apart
+        rise = inverse[near] - inverse[pixels][:, None, None]
+        steep = rise > self.limits.jump * self.noise + self.limits.slope * apart
         steep[:, RAMP, RAMP] = True  # the pixel itself
         same = inside & (label[near] == label[pixels][:, None, None])
         return torch.where(same & steep, self.height.flatten()[near], -math.inf).flatten(1).amax(1)

@@ -18,9 +18,9 @@ from pcdata.functional.touching.limits import KINECT_NOISE
 
 # Regions whose contact is weaker than this on the mean are one object.
 PARTS_FROM = 0.35
-# Square metres. A face of 6.6 cm2 (250 pixels of a Kinect at 0.85 m) has a plane; 9.2 cm2 have a curvature; in a bowl,
-# what is below the rim and smaller than 13 cm2 is a part of it.
-_FACE, _HOLLOW, _SLIVER = 6.6e-4, 9.2e-4, 1.3e-3
+# Square metres. A face of 6.6 cm2 (250 pixels of a Kinect at 0.85 m) has a plane; 9.2 cm2 have a curvature, 3.2 cm2 a
+# strong one; in a bowl, what is below the rim and smaller than 13 cm2 is a part of it.
+_FACE, _HOLLOW, _LEAST_HOLLOW, _SLIVER = 6.6e-4, 9.2e-4, 3.2e-4, 1.3e-3
 _CONTACT_PIXELS = 5  # fewer are no contact
 # The inside of a bowl: mean sine of the rise over tangent planes, and the part that rises. Real bowls have 0.07 to 0.29
 # and boxes and cylinders seen from outside less than 0.
@@ -28,11 +28,11 @@ _HOLLOW_RISE, _HOLLOW_PART, _NOT_CONVEX = 0.06, 0.6, -0.05
 _RIM, _WALL_RIM, _WITHIN = 0.015, 0.02, 0.015  # metres
 # Two parts of one face: their planes turn less than 14 degrees, and each other's middle is off by less than 3 cm; one
 # plane fits both nearly as well as each its own; they are beside each other, within 25 cm; and the way from one to the
-# other is hidden. Where they touch it is seen, and all is stricter.
+# other is hidden. Where they touch it is seen, and all is stricter; pixels without a reading say nothing, up to half.
 _TURN, _OFF, _APART, _BESIDE = 14.0, 0.03, 0.25, 0.5
 _PLANE_RMS, _CURVED_RMS = 0.0035, 0.012
 _MOST_FREE, _LEAST_HIDDEN, _LEAST_UNSEEN = 0.1, 0.25, 0.6
-_TOUCH_TURN, _TOUCH_APART, _TOUCH_SEEN, _TOUCH_RMS = 8.0, 0.006, 0.9, 0.004
+_TOUCH_TURN, _TOUCH_APART, _TOUCH_SEEN, _TOUCH_UNSEEN, _TOUCH_RMS = 8.0, 0.006, 0.9, 0.5, 0.004
 
 # Why regions were joined that no weak contact joined.
 REASONS = ("hollow", "occluded", "touching")
@@ -134,7 +134,7 @@ def join_hollows(objects: Objects) -> None:
     contacts = objects.contacts()
     depth = scene.points[:, 2].cpu()
     for start, face in faces.items():
-        if face.area < _HOLLOW or not (face.hollow[0] > _HOLLOW_RISE and face.hollow[1] > _HOLLOW_PART):
+        if not _is_hollow(face):
             continue
         rim, seen, todo = face.top, {start}, [start]
         while todo:
@@ -157,6 +157,14 @@ def join_hollows(objects: Objects) -> None:
                 objects.join(start, other, "hollow")
                 if is_inside:
                     todo.append(other)
+
+
+def _is_hollow(face: Face) -> bool:
+    """Say whether a face is concave as a whole; the smaller it is the clearer, as it has fewer normals to average."""
+    if face.area < _LEAST_HOLLOW:
+        return False
+    rise, part = face.hollow
+    return rise > _HOLLOW_RISE * math.sqrt(max(_HOLLOW / face.area, 1.0)) and part > _HOLLOW_PART
 
 
 def _is_wall(objects: Objects, pair: tuple[int, int], inside: int, rim: float, depth: torch.Tensor) -> bool:
@@ -198,7 +206,8 @@ def join_occluded(objects: Objects) -> None:
         if distance > _APART:
             continue
         hidden, on, free, unseen = objects.scene.seen_between(between)
-        is_cut = turn < _TOUCH_TURN and distance < _TOUCH_APART and on > _TOUCH_SEEN and joint < _TOUCH_RMS * rough
+        is_seen = on > _TOUCH_SEEN * (1 - unseen) and unseen < _TOUCH_UNSEEN
+        is_cut = turn < _TOUCH_TURN and distance < _TOUCH_APART and is_seen and joint < _TOUCH_RMS * rough
         is_occluded = free < _MOST_FREE and hidden > _LEAST_HIDDEN and hidden + unseen > _LEAST_UNSEEN
         if is_cut or (is_occluded and one.overlap_across(other) > _BESIDE):
             objects.join(a, b, "touching" if is_cut else "occluded")

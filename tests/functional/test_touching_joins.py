@@ -1,4 +1,4 @@
-"""Scene.highest_up_ramps: what a sensor has smeared is passed, surfaces are not followed."""
+"""What joins the parts of bowls: ramps up to the rim are passed but no surfaces followed; small insides are told."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 
 from pcdata.functional.touching.contacts import Contacts
 from pcdata.functional.touching.faces import Scene
+from pcdata.functional.touching.joining import Objects, join_hollows, join_occluded
 from pcdata.functional.touching.limits import KINECT_NOISE, RAMP, Limits
 from pcdata.functional.touching.regions import PixelCamera
 
@@ -69,3 +70,41 @@ def test_nor_is_what_another_region_has_or_is_farther_than_ramps_are_long():
     assert torch.equal(far.highest_up_ramps(pixels), far.height[18])
     far.height[18 + RAMP] = 0.2
     assert torch.equal(far.highest_up_ramps(pixels), torch.full_like(far.height[18], 0.2))
+
+
+def cup(radius: float, *, hollow: bool = True) -> Scene:
+    """Look straight down, from 0.8 m, at half a ball of some radius, open or upside down, in two regions."""
+    rows_, columns = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in (ROWS, COLUMNS)), indexing="ij")
+    x, y = (columns - CAMERA.cx) / CAMERA.fx * 0.8, (rows_ - CAMERA.cy) / CAMERA.fy * 0.8
+    rise = (radius**2 - x * x - y * y).clamp(min=0).sqrt()
+    there = x * x + y * y < (0.9 * radius) ** 2
+    depth = 0.8 + (rise if hollow else -rise)
+    normal = torch.stack([-x, -y, -rise] if hollow else [x, y, -rise], -1) / radius
+    label = torch.where(there, (columns > CAMERA.cx + 0.5 * radius * CAMERA.fx / 0.8).long(), -1)
+    first = (label[:, :-1] == 0) & (label[:, 1:] == 1)
+    pixel = torch.arange(ROWS * COLUMNS).reshape(ROWS, COLUMNS)[:, :-1][first]
+    contacts = Contacts(pixel, pixel + 1, torch.ones(len(pixel), dtype=torch.float64))
+    inverse = torch.where(there, 1 / depth, 0.0)
+    height = torch.where(there, 0.9 - depth, 0.0)
+    return Scene(inverse, label, torch.where(there[..., None], normal, 0.0), height, contacts, CAMERA, 1e-3, Limits())
+
+
+@pytest.mark.parametrize("radius", [0.016, 0.02, 0.03])
+def test_the_parts_of_a_small_inside_are_one_and_those_of_a_ball_stay(radius):
+    for hollow in (True, False):
+        objects = Objects(cup(radius, hollow=hollow))
+        assert objects.face([0]).area < 2.2e-3
+        join_hollows(objects)
+        assert objects.object_of == ([0, 0] if hollow else [0, 1])
+
+
+@pytest.mark.parametrize("every", [2, 4])
+def test_what_was_not_read_between_two_parts_of_a_face_says_nothing(every):
+    label = (torch.arange(COLUMNS) >= 30).long().expand(ROWS, COLUMNS).clone()
+    inverse = torch.full((ROWS, COLUMNS), 1 / 0.8, dtype=torch.float64)
+    inverse[::every, 29:31], label[::every, 29:31] = 0, -1
+    objects = Objects(scene(inverse, torch.zeros_like(inverse), label))
+    _, between = objects.face([0]).way_to(objects.face([1]))
+    assert objects.scene.seen_between(between)[3] > 0.1  # of the way nothing is known
+    join_occluded(objects)
+    assert objects.object_of == [0, 0]
