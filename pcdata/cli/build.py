@@ -164,24 +164,24 @@ def _build(arguments: argparse.Namespace) -> int:
         if not isinstance(report.folder, Path) and not is_read_at_urls(config.output.format):
             print(f"         {config.output.format} is read from a copy on the disk; webdataset also where it is")
         path = arguments.source or str(getattr(source, "path", "SOURCE"))
-        for note in [*notes_of(config, report), *_pose_notes(config, source, report, path)]:
+        for note in [*notes_of(config, report), *_look(config, source, report, path)]:
             print(f"note     {note}")
         if report.quarantined and isinstance(report.folder, Path):
             print("         once the cause is mended, the same command with --retry-quarantined tries those again")
     return QUARANTINED if report.quarantined and arguments.max_bad is None else 0
 
 
-def _pose_notes(config: BuildConfig, source: Any, report: BuildReport, path: str) -> list[str]:
-    """Say that clouds lie elsewhere than they should, where a step put them where the poses of their captures say."""
+def _look(config: BuildConfig, source: Any, report: BuildReport, path: str) -> list[str]:
+    """Say that the clouds are of another size than things are, or lie elsewhere, as a look at a few captures tells."""
     from pcdata.transforms import FuseTSDF, ToFrame
-    from pcdata.validation.pose_look import pose_warning
+    from pcdata.validation.first_look import first_look
 
-    by_pose = [
+    by_pose = any(
         isinstance(step, FuseTSDF) or (isinstance(step, ToFrame) and step.matrix is None)
         for step in config.pipeline.parts()
-    ]
+    )
     # Only what a worker has loaded: a capture may hang, or end the process that reads it.
-    told = pose_warning(source, [sample.id for sample in report.samples], path) if any(by_pose) else None
+    told = first_look(source, [sample.id for sample in report.samples], path, by_pose=by_pose)
     return [] if told is None else [told]
 
 

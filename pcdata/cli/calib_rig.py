@@ -51,30 +51,30 @@ def _overlap(arguments: argparse.Namespace) -> int | None:
     from pcdata.files.strict_json import json_text
     from pcdata.report.overlap_figure import save_overlap_figure
     from pcdata.validation import verify_overlap
-    from pcdata.validation.pose_look import wrong_poses
+    from pcdata.validation.first_look import first_fault
     from pcdata.verdicts import Verdict, worst
 
     captures = _load("calib overlap", arguments, arguments.calibration)
     with text_files("overlap", json=arguments.json) as write:
         stands = _stands(captures)
         results = [verify_overlap(*stand, names=_names(stand[0])) for stand in stands]
-        directions = [wrong_poses(stand[:1]) for stand in stands]
-        verdict = worst([*(result.verdict for result in results), *(one.verdict for one in directions if one)])
+        faults = [first_fault(stand[:1]) for stand in stands]
+        verdict = worst([*(result.verdict for result in results), *(one.verdict for one in faults if one)])
         told = [
             {
                 "captures": [capture.sample_id for capture in stand],
                 **result.to_json(),
-                "pose_direction": None if direction is None else direction.to_json(),
+                "fault": None if fault is None else fault.to_json(),
             }
-            for stand, result, direction in zip(stands, results, directions)
+            for stand, result, fault in zip(stands, results, faults)
         ]
         write("json", json_text({"verdict": verdict, "stands": told}, indent=2) + "\n")
-    for stand, result, direction in zip(stands, results, directions):
+    for stand, result, fault in zip(stands, results, faults):
         if len(stands) > 1:
             print(f"capture {', '.join(str(capture.sample_id) for capture in stand)}")
         print(result.text())
-        if direction is not None:
-            print(f"  poses: {direction.found}: {direction.verdict}\n  -> {direction.advice}")
+        if fault is not None:
+            print(f"  {fault.name}: {fault.found}: {fault.verdict}\n  -> {fault.advice}")
     if len(stands) > 1:
         print(
             f"overlap: {verdict}, the worst of {len(stands)} stands: cameras moved in between, so each is judged alone"

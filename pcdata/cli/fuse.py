@@ -49,7 +49,7 @@ def _fuse(arguments: argparse.Namespace) -> None:
     from pcdata.io import write_ply, write_volume
     from pcdata.io.sources.capture_source import check_apart
     from pcdata.structures import TSDFVolume
-    from pcdata.validation.pose_look import pose_warning
+    from pcdata.validation.first_look import first_look
 
     volume = TSDFVolume(
         voxel_size=arguments.voxel_size,
@@ -61,7 +61,7 @@ def _fuse(arguments: argparse.Namespace) -> None:
     source = open_captures(arguments.path, arguments, limit=arguments.limit)
     check_apart("fuse: --out", out, source)
     with ProgressBar("fuse") as progress:
-        if told := pose_warning(source, source.ids, arguments.path):
+        if told := first_look(source, source.ids, arguments.path):
             progress.note(told)
         for done, sample_id in enumerate(source.ids, 1):
             volume.integrate(source.load(sample_id))

@@ -1,7 +1,8 @@
-"""Whoever makes clouds by poses is told where another convention fits better; right poses get no word."""
+"""Whoever makes clouds is told of a unit or poses that cannot be right; right ones get no word."""
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from pcdata.geometry import rigid
 from pcdata.io import write_capture
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import tabletop
-from pcdata.validation.pose_look import pose_warning, wrong_poses
+from pcdata.validation.first_look import first_fault, first_look
 from pcdata.verdicts import Verdict
 
 
@@ -29,14 +30,14 @@ def frame_of(*, wrong: tuple[int, ...] = ()) -> DepthFrame:
 
 def test_right_poses_unposed_captures_and_clouds_get_no_word() -> None:
     right = frame_of()
-    assert wrong_poses([right]) is None
-    assert wrong_poses([replace(right, world_from_camera=None, frame_id=None)]) is None
-    assert wrong_poses([]) is None
+    assert first_fault([right]) is None
+    assert first_fault([replace(right, world_from_camera=None, frame_id=None)]) is None
+    assert first_fault([]) is None
 
 
 @pytest.mark.parametrize("wrong", [(0, 1), (1,)])
 def test_inverted_poses_are_told(wrong: tuple[int, ...]) -> None:
-    found = wrong_poses([frame_of(wrong=wrong)])
+    found = first_fault([frame_of(wrong=wrong)])
     assert found is not None
     assert found.verdict is Verdict.FAIL
     assert "camera_from_world" in found.advice
@@ -63,7 +64,7 @@ def moving(tmp_path: Path) -> Path:
 def test_the_commands_that_use_poses_say_so(moving: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = open_source(moving)
     assert source.ids == ["a", "b"]
-    assert "camera_from_world" in (pose_warning(source, source.ids, "my captures") or "")
+    assert "camera_from_world" in (first_look(source, source.ids, "my captures") or "")
     words = ["build", "--model", "dp3_sim", "--set", "crop=none", "--source", str(moving)]
     assert main([*words, "--set", "frame=base", "--out", str(tmp_path / "set")]) == 0
     assert "note     the poses look wrong: " in capsys.readouterr().out
@@ -87,3 +88,20 @@ def test_overlap_fails_a_view_whose_pose_is_inverted(tmp_path: Path, capsys: pyt
     write_capture(replace(far, world_from_camera=poses), tmp_path / "far")
     main(["calib", "overlap", str(tmp_path / "far")])
     assert "shares no surface with another camera; if it should, check its pose" in capsys.readouterr().out
+
+
+def test_a_unit_that_does_not_fit_comes_before_poses_and_needs_none(
+    moving: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    right = frame_of()
+    wrong = replace(right, depth=0.1 * right.depth, provenance={"metres_per_unit": 0.0001})
+    found = first_fault([wrong])
+    assert found is not None
+    assert found.name == "depth_unit"
+    assert first_fault([replace(wrong, world_from_camera=None, frame_id=None)], by_pose=False) == found
+    stated = moving / "intrinsics.json"
+    unit = json.loads(stated.read_text())
+    stated.write_text(json.dumps(unit | {"metres_per_unit": 0.1 * unit["metres_per_unit"]}))
+    words = ["build", "--model", "dp3_sim", "--set", "crop=none", "--set", "frame=camera", "--source", str(moving)]
+    assert main([*words, "--out", str(tmp_path / "set")]) == 0
+    assert "note     the unit of depth looks wrong: half of the readings lie within" in capsys.readouterr().out
