@@ -13,6 +13,7 @@ import pcdata
 import pcdata.functional
 from pcdata import extras
 from pcdata.contracts import dispatch
+from pcdata.files.sample_names import counted
 from pcdata.report.plain_table import text_table
 
 _WIDTH = 120  # columns of a line
@@ -21,10 +22,11 @@ _WIDTH = 120  # columns of a line
 def health_text() -> str:
     """Return the report of ``pcdata doctor``."""
     cuda = "none" if not torch.cuda.is_available() else torch.cuda.get_device_name(0)
+    threads = counted(torch.get_num_threads(), "thread")
     machine = [
         ["pcdata", pcdata.__version__],
         ["Python", f"{platform.python_version()} on {platform.system()} {platform.machine()}"],
-        ["torch", f"{torch.__version__}, {torch.get_num_threads()} threads, {os.cpu_count()} cores"],
+        ["torch", f"{torch.__version__}, {threads}, {counted(os.cpu_count() or 1, 'core')}"],
         ["CUDA device", cuda],
     ]
     backends = []

@@ -148,6 +148,10 @@ class OverlapResult:
         """Return the numbers as lines for a terminal."""
         lines = [f"overlap: {self.verdict}"]
         for pair in self.pairs:
+            if math.isnan(pair.median):
+                shared = f"overlap {100 * pair.overlap:.0f} %, too little to measure"
+                lines.append(f"  {pair.first} - {pair.second}: {shared}: {pair.verdict}")
+                continue
             lines.append(
                 f"  {pair.first} - {pair.second}: median {1e3 * pair.median:.1f} mm, 90 % below {1e3 * pair.p90:.1f} "
                 f"mm, mean {1e3 * pair.mean:+.1f} mm, overlap {100 * pair.overlap:.0f} %: {pair.verdict}"

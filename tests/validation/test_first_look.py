@@ -87,7 +87,10 @@ def test_overlap_fails_a_view_whose_pose_is_inverted(tmp_path: Path, capsys: pyt
     poses[1, :3, 3] += torch.from_numpy(np.array([50.0, 0.0, 0.0]))
     write_capture(replace(far, world_from_camera=poses), tmp_path / "far")
     main(["calib", "overlap", str(tmp_path / "far")])
-    assert "shares no surface with another camera; if it should, check its pose" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "shares no surface with another camera; if it should, check its pose" in out
+    assert "overlap 0 %, too little to measure" in out
+    assert "nan" not in out
 
 
 def test_a_unit_that_does_not_fit_comes_before_poses_and_needs_none(
