@@ -135,7 +135,9 @@ def calls() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
             partial(_into_box, lens, moved=True, flying=(0.01, 3)),
         )
     some = torch.arange(400) % 5 > 0
-    yield "radius_outliers_within", "one", lambda: ((points(400, 3), ptr_of(400), some, 4, 0.03, None), {})
+    yield "rows_in_company", "all", lambda: ((points(400, 3), ptr_of(250, 150), 4, 0.03, None), {})
+    yield "rows_in_company", "within", lambda: ((points(400, 3), ptr_of(400), 4, 0.03, None, some), {})
+    yield "usual_rows", "two", lambda: ((points(400, 3), ptr_of(250, 150), 8, 1.5, None), {})
     yield "nearest_chunks", "radius", lambda: ((points(400, 3), ptr_of(400), 6), {"radius": 0.03})
     asked = _queries({})
     searched = asked.pop("points"), asked.pop("ptr"), 5
@@ -201,6 +203,8 @@ def _calls_of_searches() -> Iterator[tuple[str, str, Callable[[], Arguments]]]:
     yield "window_medians", "two", lambda: ((values, cloud, ptr, None), {})
     yield "window_medians", "on a grid", _medians
     yield "facing_normals", "one place", lambda: ((cloud, cloud.flip(0), torch.tensor([[0.1, 0.2, 0.3]])), {})
+    place = torch.tensor([0.1, 0.2, 0.3])
+    yield "normals_facing", "one place", lambda: ((cloud, ptr, 0.05, 9, None, place), {})
     yield "hull_rows", "two", lambda: ((cloud[:, :2].double(),), {})
     places = torch.tensor([[0.0, 0.0, 1.0], [0.1, 0.0, 0.9]], dtype=torch.float64)
     yield "reaches", "two", lambda: ((cloud, ptr, places, 0.01), {})

@@ -197,6 +197,19 @@ def kernel(name: str, backend: str, *, roomy: bool = False) -> Callable[[Callabl
     return decorate
 
 
+def held_to(name: str, **arguments: Any) -> dict[str, Any]:
+    """Hold the arguments of an inner function that does the work of an operation to its contract; for kernels.
+
+    Raises:
+        PcdataError: what the operation would raise.
+    """
+    contract = OPERATIONS[name].contract
+    assert contract is not None  # it is no inner function
+    contract.check(arguments)
+    _tidy(arguments, detach=True, contiguous=True)
+    return arguments
+
+
 def roomy_body(name: str, device: torch.device) -> Callable[..., Any] | None:
     """Return the body of an operation that takes arrays with room for more rows than their ``ptr`` counts, or None.
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from pcdata.contracts.compiling import is_traced
 from pcdata.contracts.dispatch import inner, op
 from pcdata.contracts.host import all_finite
-from pcdata.contracts.known import FINITE, is_known
+from pcdata.contracts.known import FINITE, is_known, note
 from pcdata.contracts.numbers import checked_count, checked_length
 from pcdata.contracts.operators import Traced
 from pcdata.errors import DeviceError, DTypeError, NonFiniteError, ShapeError
@@ -101,9 +101,24 @@ def orient_normals(
     Raises:
         ShapeError, DTypeError, DeviceError, NonFiniteError: an argument breaks the contract above.
     """
-    _check_viewpoint(points, normals, viewpoint)
+    check_viewpoint(points, normals, viewpoint)
     turned = _turned if is_traced() else facing_normals  # a compiler knows what to do with the plain one
     return turned(points, normals, viewpoint)
+
+
+@inner
+def normals_facing(
+    points: Tensor,
+    ptr: Tensor,
+    radius: float | None,
+    max_neighbors: int,
+    grid: ImageGrid | None,
+    viewpoint: Tensor,  # as orient_normals takes it
+) -> Tensor:
+    """Estimate normals and turn them to the viewpoint; raises what :func:`estimate_normals` and the other raise."""
+    normals = estimate_normals(points, ptr, radius=radius, max_neighbors=max_neighbors, grid=grid)
+    note(FINITE, normals)  # those of finite points are
+    return orient_normals(points, normals, viewpoint)
 
 
 @inner
@@ -118,7 +133,8 @@ def _turned(points: Tensor, normals: Tensor, viewpoint: Tensor) -> Tensor:
     return torch.where(((x + y) + z < 0)[:, None], -normals, normals)
 
 
-def _check_viewpoint(points: Tensor, normals: Tensor, viewpoint: Tensor) -> None:
+def check_viewpoint(points: Tensor, normals: Tensor, viewpoint: Tensor) -> None:
+    """Require what :func:`orient_normals` does."""
     where = "orient_normals"
     for name, value in (("points", points), ("normals", normals), ("viewpoint", viewpoint)):
         if not isinstance(value, Tensor) or not value.dtype.is_floating_point:

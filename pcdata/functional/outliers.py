@@ -7,6 +7,7 @@ cases were found by experiment; Rusu et al., Toward 3D point cloud based object 
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,7 +18,7 @@ from pcdata.contracts.operators import Traced
 from pcdata.functional.image_grid import ImageGrid, checked_grid
 from pcdata.functional.nearest import nearest_chunks, pair_chunks, rooted
 from pcdata.functional.radius import require_extent, squared_radius
-from pcdata.functional.rows import cloud_of_rows, counts_from_ptr, ptr_after_mask
+from pcdata.functional.rows import KeptRows, cloud_of_rows, counts_from_ptr, kept_rows, ptr_after_mask
 
 # Interleaved sums: as many as threads of a GPU that work together.
 _RUNS = 1024
@@ -79,6 +80,13 @@ def statistical_outlier_mask(
     deviation = (_interleaved_sum(spread, ptr) / (counts - 1)).sqrt()
     threshold = average + std_ratio * deviation
     return ~((mean > 0) & (mean < threshold[cloud]))
+
+
+@inner
+def usual_rows(points: Tensor, ptr: Tensor, num_neighbors: int, std_ratio: float, grid: ImageGrid | None) -> KeptRows:
+    """Keep the rows that :func:`statistical_outlier_mask` does not mark; raises what that raises."""
+    outlier = statistical_outlier_mask(points, ptr, num_neighbors=num_neighbors, std_ratio=std_ratio, grid=grid)
+    return kept_rows(outlier, ptr, gone=True)
 
 
 def _interleaved_sum(values: Tensor, ptr: Tensor) -> Tensor:
@@ -145,18 +153,19 @@ def radius_outlier_mask(
 
 
 @inner
-def radius_outliers_within(
-    points: Tensor,  # (N, 3) float32, all finite
+def rows_in_company(
+    points: Tensor,  # (N, 3) float32
     ptr: Tensor,  # (B+1,)
-    within: Tensor,  # (N,) bool
     min_neighbors: int,
     radius: float,
     grid: ImageGrid | None,
-) -> Tensor:  # (N,) bool
-    """Mark outliers as :func:`radius_outlier_mask` does, where the points ``within`` are all that there are."""
+    within: Tensor | None = None,  # (N,) bool: the points that there are, all of them finite
+) -> KeptRows:
+    """Keep the rows that :func:`radius_outlier_mask` does not mark; raises what that raises."""
+    fields: dict[str, Any] = {"min_neighbors": min_neighbors, "radius": radius}
+    if within is None:
+        return kept_rows(radius_outlier_mask(points, ptr, **fields, grid=grid), ptr, gone=True)
     left = None if grid is None else replace(grid, pixel_index=grid.pixel_index[within])
     outlier = torch.zeros_like(within)
-    outlier[within] = radius_outlier_mask(
-        points[within], ptr_after_mask(within, ptr), min_neighbors=min_neighbors, radius=radius, grid=left
-    )
-    return outlier
+    outlier[within] = radius_outlier_mask(points[within], ptr_after_mask(within, ptr), **fields, grid=left)
+    return kept_rows(outlier, ptr, gone=True, within=within)

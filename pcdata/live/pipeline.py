@@ -248,7 +248,7 @@ class LivePipeline:
             self._count(self._pass_name(done + steps.start, done + steps.stop), now - since)
             since = now
 
-        with torch.no_grad(), guessing_planes(self._planes):
+        with torch.set_grad_enabled(False), guessing_planes(self._planes):
             if self._fixed is not None:
                 if seen is None:
                     self._since = since

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pcdata.errors import PcdataWarning, ReplayError, TooFewPointsError
 from pcdata.functional.fixed_rows import FixedRows, move_kept
-from pcdata.functional.rows import kept_rows
+from pcdata.functional.rows import KeptRows, kept_rows
 from pcdata.rng import Streams
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.transforms.base import Params, Transform, sample_name
@@ -132,9 +132,13 @@ def kept_params(marks: Tensor, ptr: Tensor, *, gone: bool = False, within: Tenso
 
     Of the rows ``within`` alone, if that is given.
     """
-    keep, kept_ptr, sums = kept_rows(marks, ptr, gone=gone, within=within)
-    params = {"index": keep, "ptr": kept_ptr}
-    return params if sums is None else {**params, TOLD_ROWS: sums}
+    return params_of(kept_rows(marks, ptr, gone=gone, within=within))
+
+
+def params_of(kept: KeptRows) -> Params:
+    """Return the params of a selection that keeps such rows."""
+    params = {"index": kept.keep, "ptr": kept.ptr}
+    return params if kept.sums is None else {**params, TOLD_ROWS: kept.sums}
 
 
 class RemoveTransform(DropLimit, SelectTransform, abstract=True):

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 from pcdata.contracts.dispatch import roomy_body
 from pcdata.contracts.known import FINITE, note
 from pcdata.errors import FrameError
 from pcdata.functional.fixed_rows import FixedRows
-from pcdata.functional.normals import estimate_normals, orient_normals
+from pcdata.functional.normals import estimate_normals, normals_facing, orient_normals
 from pcdata.functional.rows import cloud_of_rows
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params, Transform
@@ -55,17 +55,14 @@ class EstimateNormals(Transform):
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Estimate from the points of each cloud alone, and write the normals."""
-        normals = estimate_normals(
-            data.points, data.ptr, radius=self.radius, max_neighbors=self.max_neighbors, grid=data.image_grid()
-        )
-        if self.orient == "viewpoint":
-            is_one = data.num_clouds == 1 and "viewpoint" not in data.extra
-            viewpoint = data.viewpoint if is_one else data.viewpoint_per_point()
-            if viewpoint is None:
-                raise FrameError(
-                    "EstimateNormals: the cloud has no viewpoint to face; set PointCloud.viewpoint to where the sensor "
-                    "stood, or choose orient: none"
-                )
-            note(FINITE, normals)  # those of finite points are
-            normals = orient_normals(data.points, normals, viewpoint)
-        return data.with_fields(normals=normals)
+        search: dict[str, Any] = {"radius": self.radius, "max_neighbors": self.max_neighbors, "grid": data.image_grid()}
+        if self.orient == "none":
+            return data.with_fields(normals=estimate_normals(data.points, data.ptr, **search))
+        is_one = data.num_clouds == 1 and "viewpoint" not in data.extra
+        viewpoint = data.viewpoint if is_one else data.viewpoint_per_point()
+        if viewpoint is None:
+            raise FrameError(
+                "EstimateNormals: the cloud has no viewpoint to face; set PointCloud.viewpoint to where the sensor "
+                "stood, or choose orient: none"
+            )
+        return data.with_fields(normals=normals_facing(data.points, data.ptr, **search, viewpoint=viewpoint))

@@ -9,12 +9,12 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import roomy_body
 from pcdata.functional.fixed_rows import FixedRows
-from pcdata.functional.outliers import radius_outlier_mask, radius_outliers_within, statistical_outlier_mask
+from pcdata.functional.outliers import rows_in_company, usual_rows
 from pcdata.rng import Streams
 from pcdata.sensors import SensorProfile
 from pcdata.structures import PointCloud
 from pcdata.transforms.base import Params
-from pcdata.transforms.families import GEOMETRY, RemoveTransform, kept_params
+from pcdata.transforms.families import GEOMETRY, RemoveTransform, params_of
 from pcdata.transforms.field_types import Count, FromSensor, Metres, Positive
 
 
@@ -37,10 +37,7 @@ class RemoveStatisticalOutliers(RemoveTransform):
 
     def pick(self, cloud: PointCloud, streams: Streams) -> Params:
         """Keep the usual rows."""
-        outlier = statistical_outlier_mask(
-            cloud.points, cloud.ptr, num_neighbors=self.num_neighbors, std_ratio=self.std_ratio, grid=cloud.image_grid()
-        )
-        return kept_params(outlier, cloud.ptr, gone=True)
+        return params_of(usual_rows(cloud.points, cloud.ptr, self.num_neighbors, self.std_ratio, cloud.image_grid()))
 
     def fixed_keep(self, like: FixedRows) -> Callable[[FixedRows], Tensor] | None:
         """Mark the usual rows."""
@@ -63,10 +60,7 @@ class RemoveRadiusOutliers(RemoveTransform):
 
     def pick(self, cloud: PointCloud, streams: Streams) -> Params:
         """Keep the rows with company."""
-        outlier = radius_outlier_mask(
-            cloud.points, cloud.ptr, min_neighbors=self.min_neighbors, radius=self.radius, grid=cloud.image_grid()
-        )
-        return kept_params(outlier, cloud.ptr, gone=True)
+        return params_of(rows_in_company(cloud.points, cloud.ptr, self.min_neighbors, self.radius, cloud.image_grid()))
 
     def decides_within(self, share: float) -> bool:
         """Where it does not have to pass over more rows than it looks at."""
@@ -75,8 +69,7 @@ class RemoveRadiusOutliers(RemoveTransform):
     def params_within(self, data: PointCloud, within: Tensor, ptr: Tensor) -> Params:
         """Keep the rows with company among some."""
         fields = self.min_neighbors, self.radius, data.image_grid()
-        outlier = radius_outliers_within(data.points, data.ptr, within, *fields)
-        return kept_params(outlier, data.ptr, gone=True, within=within)
+        return params_of(rows_in_company(data.points, data.ptr, *fields, within))
 
     def fixed_keep(self, like: FixedRows) -> Callable[[FixedRows], Tensor] | None:
         """Mark the rows with company."""

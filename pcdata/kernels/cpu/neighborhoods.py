@@ -9,10 +9,10 @@ from torch import Tensor
 
 # The operations must be registered before their kernels.
 import pcdata.functional.clusters
-import pcdata.functional.neighborhoods
-import pcdata.functional.normals  # noqa: F401
-from pcdata.contracts.dispatch import INNER, kernel
+import pcdata.functional.neighborhoods  # noqa: F401
+from pcdata.contracts.dispatch import INNER, held_to, kernel
 from pcdata.functional.image_grid import ImageGrid
+from pcdata.functional.normals import check_viewpoint
 from pcdata.functional.radius import require_cells
 from pcdata.kernels.cpu.native import answers, call, room, room_for
 from pcdata.kernels.cpu.search_arguments import core_rows, grid_arguments, limit_of, reachable
@@ -23,10 +23,35 @@ def estimate_normals(
     *, points: Tensor, ptr: Tensor, radius: float | None, max_neighbors: int, grid: ImageGrid | None
 ) -> Tensor:
     """Run the reference's contract in the core."""
+    return _normals(points, ptr, radius, max_neighbors, grid, None)
+
+
+@kernel("normals_facing", "cpu")
+def normals_facing(
+    points: Tensor, ptr: Tensor, radius: float | None, max_neighbors: int, grid: ImageGrid | None, viewpoint: Tensor
+) -> Tensor:
+    """Do so, and turn them in the same call; a place of another dtype than float32 is the reference's."""
+    if viewpoint.dtype is not torch.float32:
+        found: Tensor = INNER["normals_facing"].reference(points, ptr, radius, max_neighbors, grid, viewpoint)
+        return found
+    given = {"points": points, "ptr": ptr, "radius": radius, "max_neighbors": max_neighbors, "grid": grid}
+    held = held_to("estimate_normals", **given)
+    check_viewpoint(points, points, viewpoint)
+    return _normals(**held, viewpoint=viewpoint.detach().contiguous())
+
+
+def _normals(
+    points: Tensor,
+    ptr: Tensor,
+    radius: float | None,
+    max_neighbors: int,
+    grid: ImageGrid | None,
+    viewpoint: Tensor | None,
+) -> Tensor:
     points, ptr = core_rows(points, ptr)
-    normals = room(points.shape, points.dtype)
-    most = reachable(max_neighbors, points)
-    call("pc_normals", points, ptr, ptr.shape[0] - 1, most, limit_of(radius), *grid_arguments(grid), normals)
+    normals = room(points.shape, torch.float32)
+    search = ptr.shape[0] - 1, reachable(max_neighbors, points), limit_of(radius), *grid_arguments(grid)
+    call("pc_normals", points, ptr, *search, viewpoint, viewpoint is not None and viewpoint.numel() == 3, normals)
     return normals
 
 

@@ -4,7 +4,7 @@ Written by core/write_signatures.py from core/pc/exports.hpp, which says what th
 """
 
 # A hash of the declarations, which a library built from them has in it.
-INTERFACE_NUMBER = 0x556D9619C2BE3FF
+INTERFACE_NUMBER = 0x24DB2E908835824
 
 DECLARATIONS = """
 pc_advise_huge_pages: int64 count, int64* addresses, int64* bytes
@@ -103,12 +103,12 @@ pc_nearest_squared: float* points, int64* ptr, int64 num_clouds, float* queries,
 pc_neighborhood_shapes: float* points, int64 num_points, int64* index, int64 num_queries, int64 k, float* centers,
     float* mean, double* covariance, int64* counts
 pc_normals: float* points, int64* ptr, int64 num_clouds, int64 max_neighbors, double limit, int64* pixel, int64 width,
-    double* camera, float* normals
+    double* camera, float* viewpoint, int64 one_for_all, float* normals
 pc_face_normals: float* points, float* normals, int64 count, float* viewpoint, int64 one_for_all, float* facing
 pc_statistical_outliers: float* points, int64* ptr, int64 num_clouds, int64 num_neighbors, double std_ratio, int64*
-    pixel, int64 width, double* camera, double* mean, bool* outlier
+    pixel, int64 width, double* camera, double* mean, uint8* marks, int64* kept_ptr, int64* sums
 pc_radius_outlier_mask: float* points, int64* ptr, int64 clouds, double radius, int64 min_neighbors, int64* pixel, int64
-    width, uint8* within, uint8* outlier, double* largest
+    width, uint8* within, uint8* marks, int64* kept_ptr, int64* sums, double* largest
 pc_dbscan: float* points, int64* ptr, int64 clouds, double eps, int64 min_points, int64* labels, double* largest
 pc_farthest_points: float* points, int64* ptr, int64 num_clouds, uint8* within, int64 num_rows, int64* wanted, int64*
     picks, int64* rows

@@ -20,7 +20,7 @@ def means(points: Tensor, k: int, pixel: Tensor | None = None, width: int = 0) -
     found = torch.full((len(points),), torch.nan, dtype=torch.float64)
     outlier = torch.empty(len(points), dtype=torch.bool)
     ptr = torch.tensor([0, len(points)])
-    native.call("pc_statistical_outliers", points, ptr, 1, k, 2.0, pixel, width, None, found, outlier)
+    native.call("pc_statistical_outliers", points, ptr, 1, k, 2.0, pixel, width, None, found, outlier, None, None)
     return found
 
 

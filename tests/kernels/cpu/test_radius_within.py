@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import Tensor
 
 from pcdata.contracts.dispatch import INNER, why_unavailable
 from pcdata.errors import ConfigError
@@ -19,12 +20,13 @@ pytestmark = pytest.mark.skipif(REASON is not None, reason=str(REASON))
 SHARES = [0.0, 0.02, 0.5, 0.97, 1.0]
 
 
-def both(*arguments: object) -> None:
-    found, expected = (body(*arguments) for body in (OPERATION.kernels["cpu"], OPERATION.reference))
-    assert torch.equal(found, expected)
+def both(points: Tensor, ptr: Tensor, within: Tensor, *arguments: object) -> None:
+    given = points, ptr, *arguments, within
+    for found, expected in zip(OPERATION.kernels["cpu"](*given), OPERATION.reference(*given), strict=True):
+        assert torch.equal(found, expected)
 
 
-OPERATION = INNER["radius_outliers_within"]
+OPERATION = INNER["rows_in_company"]
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,7 @@ def test_what_is_far_out_counts_where_it_is_a_point():
     points, within = torch.rand(20_000, 3, generator=seeded(2)), torch.ones(20_000, dtype=torch.bool)
     points[5] = 1e30
     with pytest.raises(ConfigError, match="stray point far out"):
-        OPERATION.kernels["cpu"](points, ptr_from_counts([20_000]), within, 3, 0.02, None)
+        OPERATION.kernels["cpu"](points, ptr_from_counts([20_000]), 3, 0.02, None, within)
     within[5] = False
     both(points, ptr_from_counts([20_000]), within, 3, 0.02, None)
     both(points[5:6], ptr_from_counts([1]), within[5:6], 3, 0.02, None)

@@ -408,30 +408,33 @@ PC_EXPORT int32_t pc_neighborhood_shapes(const pc_context* context, const float*
                                          const int64_t* index, int64_t num_queries, int64_t k, const float* centers,
                                          float* mean, double* covariance, int64_t* counts);
 
-// normals (N, 3) float; neighbors have d2 <= limit; pixel null: no grid.
+// normals (N, 3) float; neighbors have d2 <= limit; pixel null: no grid. They are turned as by pc_face_normals unless
+// viewpoint is null.
 PC_EXPORT int32_t pc_normals(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                              int64_t max_neighbors, double limit, const int64_t* pixel, int64_t width,
-                             const double* camera, float* normals);
+                             const double* camera, const float* viewpoint, int64_t one_for_all, float* normals);
 
 // facing (N, 3) = normals (N, 3), turned where they face away from the viewpoint, (N, 3) or one (3,) for all:
 // normal . (viewpoint - point) < 0, in double.
 PC_EXPORT int32_t pc_face_normals(const pc_context* context, const float* points, const float* normals, int64_t count,
                                   const float* viewpoint, int64_t one_for_all, float* facing);
 
-// mean (N,) double is working space; outlier (N,) bool. pixel null: no grid.
+// pixel null: no grid; mean (N,) double is working space, null: memory of the core's own. marks (N,): which points are
+// outliers; or, unless kept_ptr is null, which are not, with kept_ptr and sums as pc_kept_rows gives them.
 PC_EXPORT int32_t pc_statistical_outliers(const pc_context* context, const float* points, const int64_t* ptr,
                                           int64_t num_clouds, int64_t num_neighbors, double std_ratio,
                                           const int64_t* pixel, int64_t width, const double* camera, double* mean,
-                                          bool* outlier);
+                                          uint8_t* marks, int64_t* kept_ptr, int64_t* sums);
 
 // -- radius outliers and clusters -------------------------------------------------------------------------------------
 
 // pixel (N,) rising within each cloud, or null; within (N,) are the points that there are, null = all: the others are
-// no outliers; outlier (N,) out; largest (1,) out: the largest cell coordinate of any cloud. The mask is complete only
-// if that is below 2^36.
+// no outliers; marks (N,), kept_ptr and sums as of pc_statistical_outliers; largest (1,) out: the largest cell
+// coordinate of any cloud. The marks are complete only if that is below 2^36.
 PC_EXPORT int32_t pc_radius_outlier_mask(const pc_context* context, const float* points, const int64_t* ptr,
                                          int64_t clouds, double radius, int64_t min_neighbors, const int64_t* pixel,
-                                         int64_t width, const uint8_t* within, uint8_t* outlier, double* largest);
+                                         int64_t width, const uint8_t* within, uint8_t* marks, int64_t* kept_ptr,
+                                         int64_t* sums, double* largest);
 
 // labels (N,) out; largest (1,) out: the largest cell coordinate of any cloud. The labels
 // are complete only if that is below 2^36.

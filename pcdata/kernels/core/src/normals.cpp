@@ -119,12 +119,25 @@ void estimate(const pc_context& context, const Clouds& clouds, const Grid* grid,
   BatchSearch<Nearest, WriteNormals>(context, k, limit, task).run(clouds, grid);
 }
 
+void turn_to_viewpoint(const pc_context& context, const float* points, const float* normals, int64_t count,
+                       const float* viewpoint, bool one_for_all, float* facing) {
+  parallel_for(context, count, 1 << 15, [&](int64_t begin, int64_t end, int64_t) {
+    for (int64_t i = 3 * begin; i < 3 * end; i += 3) {
+      const float *p = points + i, *n = normals + i, *v = one_for_all ? viewpoint : viewpoint + i;
+      const double x = double{n[0]} * (double{v[0]} - double{p[0]}), y = double{n[1]} * (double{v[1]} - double{p[1]}),
+                   z = double{n[2]} * (double{v[2]} - double{p[2]});
+      const bool away = (x + y) + z < 0;
+      for (int axis = 0; axis < 3; ++axis) facing[i + axis] = away ? -n[axis] : n[axis];
+    }
+  });
+}
+
 }  // namespace
 }  // namespace pc::neighbors
 
 PC_EXPORT int32_t pc_normals(const pc_context* context, const float* points, const int64_t* ptr, int64_t num_clouds,
                              int64_t max_neighbors, double limit, const int64_t* pixel, int64_t width,
-                             const double* camera, float* normals) {
+                             const double* camera, const float* viewpoint, int64_t one_for_all, float* normals) {
   using namespace pc;
   using namespace pc::neighbors;
   return guarded([&] {
@@ -132,21 +145,14 @@ PC_EXPORT int32_t pc_normals(const pc_context* context, const float* points, con
     const auto run = max_neighbors <= NearestDistances::kMax ? estimate<NearestDistances> : estimate<NearestMany>;
     run(*context, {points, ptr, num_clouds}, pixel == nullptr ? nullptr : &grid, max_neighbors,
         static_cast<float>(limit), normals);
+    if (viewpoint != nullptr)
+      turn_to_viewpoint(*context, points, normals, ptr[num_clouds], viewpoint, one_for_all != 0, normals);
   });
 }
 
 PC_EXPORT int32_t pc_face_normals(const pc_context* context, const float* points, const float* normals, int64_t count,
                                   const float* viewpoint, int64_t one_for_all, float* facing) {
   using namespace pc;
-  return guarded([&] {
-    parallel_for(*context, count, 1 << 15, [&](int64_t begin, int64_t end, int64_t) {
-      for (int64_t i = 3 * begin; i < 3 * end; i += 3) {
-        const float *p = points + i, *n = normals + i, *v = one_for_all != 0 ? viewpoint : viewpoint + i;
-        const double x = double{n[0]} * (double{v[0]} - double{p[0]}), y = double{n[1]} * (double{v[1]} - double{p[1]}),
-                     z = double{n[2]} * (double{v[2]} - double{p[2]});
-        const bool away = (x + y) + z < 0;
-        for (int axis = 0; axis < 3; ++axis) facing[i + axis] = away ? -n[axis] : n[axis];
-      }
-    });
-  });
+  using namespace pc::neighbors;
+  return guarded([&] { turn_to_viewpoint(*context, points, normals, count, viewpoint, one_for_all != 0, facing); });
 }

@@ -14,6 +14,7 @@
 #include "pc/cells/cell_counts.hpp"
 #include "pc/cells/marked_sequence.hpp"
 #include "pc/cells/neighborhood.hpp"
+#include "pc/rows/kept.hpp"
 
 namespace pc::cells {
 namespace {
@@ -173,17 +174,19 @@ double search_cloud(const pc_context& context, const RadiusSearch& search) {
 
 PC_EXPORT int32_t pc_radius_outlier_mask(const pc_context* context, const float* points, const int64_t* ptr,
                                          int64_t clouds, double radius, int64_t min_neighbors, const int64_t* pixel,
-                                         int64_t width, const uint8_t* within, uint8_t* outlier, double* largest) {
+                                         int64_t width, const uint8_t* within, uint8_t* marks, int64_t* kept_ptr,
+                                         int64_t* sums, double* largest) {
   using namespace pc;
   using namespace pc::cells;
   return guarded([&] {
     const auto narrow = static_cast<float>(radius);
     std::atomic<double> most{0};
     for_each_cloud(*context, ptr, clouds, [&](const pc_context& own, int64_t first, int64_t count) {
-      raise_to(most, search_cloud(
-                         own, {points + 3 * first, count, narrow, narrow * narrow, min_neighbors + 1, outlier + first,
-                               pixel ? pixel + first : nullptr, width, within ? within + first : nullptr}));
+      raise_to(most,
+               search_cloud(own, {points + 3 * first, count, narrow, narrow * narrow, min_neighbors + 1, marks + first,
+                                  pixel ? pixel + first : nullptr, width, within ? within + first : nullptr}));
     });
     *largest = most.load();
+    if (kept_ptr != nullptr) rows::mark_kept(*context, marks, true, within, ptr, clouds, {marks, kept_ptr, sums});
   });
 }

@@ -6,6 +6,7 @@
 #include "pc/cells/lattice.hpp"
 #include "pc/neighbors/nearest_keys.hpp"
 #include "pc/neighbors/window_distances.hpp"
+#include "pc/rows/kept.hpp"
 
 namespace pc::neighbors {
 namespace {
@@ -91,7 +92,7 @@ double interleaved_sum(const pc_context& context, int64_t count, Body&& body) {
   return runs > 0 ? run[0] : 0.0;
 }
 
-void mark_outliers(const pc_context& context, const double* mean, int64_t count, double std_ratio, bool* outlier) {
+void mark_outliers(const pc_context& context, const double* mean, int64_t count, double std_ratio, uint8_t* outlier) {
   const double average = interleaved_sum(context, count, [&](int64_t i) { return mean[i]; }) / double(count);
   const double spread = interleaved_sum(context, count, [&](int64_t i) {
     const double off = mean[i] - average;
@@ -132,10 +133,12 @@ void mean_distances(const pc_context& context, const Clouds& clouds, const Grid&
 PC_EXPORT int32_t pc_statistical_outliers(const pc_context* context, const float* points, const int64_t* ptr,
                                           int64_t num_clouds, int64_t num_neighbors, double std_ratio,
                                           const int64_t* pixel, int64_t width, const double* camera, double* mean,
-                                          bool* outlier) {
+                                          uint8_t* marks, int64_t* kept_ptr, int64_t* sums) {
   using namespace pc;
   using namespace pc::neighbors;
   return guarded([&] {
+    ScratchFrame scratch;
+    if (mean == nullptr) mean = scratch.take<double>(ptr[num_clouds]);
     const Grid grid{pixel, width, camera};
     const MeanDistance task{num_neighbors, mean};
     const Clouds clouds{points, ptr, num_clouds};
@@ -146,7 +149,8 @@ PC_EXPORT int32_t pc_statistical_outliers(const pc_context* context, const float
     else
       for (int64_t b = 0; b < num_clouds; ++b) mean_distances(*context, clouds, grid, b, task);
     cells::for_each_cloud(*context, ptr, num_clouds, [&](const pc_context& own, int64_t first, int64_t count) {
-      mark_outliers(own, mean + first, count, std_ratio, outlier + first);
+      mark_outliers(own, mean + first, count, std_ratio, marks + first);
     });
+    if (kept_ptr != nullptr) rows::mark_kept(*context, marks, true, nullptr, ptr, num_clouds, {marks, kept_ptr, sums});
   });
 }
