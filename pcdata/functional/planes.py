@@ -167,9 +167,9 @@ def require_planes(found: Sequence[tuple[int, ...]], tried: int, distance: float
 
 def clouds_between(points: Tensor, ptr: Tensor, first: int, stop: int) -> tuple[Tensor, Tensor]:
     """Return the clouds [first, stop) of a batch."""
-    own = ptr[first : stop + 1]
     if stop - first == ptr.shape[0] - 1:
         return points, ptr
+    own = ptr[first : stop + 1]
     return points[int(own[0]) : int(own[-1])], own - own[0]
 
 

@@ -138,7 +138,11 @@ class _Sample(SelectTransform, abstract=True):
         wanted = self.wanted_counts(cloud, streams)
         counts = self._counts(cloud, wanted, counts_of(cloud.ptr))
         seeds = streams.seeds().tolist() if self.is_random else [0] * cloud.num_clouds
-        return self._filled(self.sample(cloud, counts, seeds), counts, wanted, seeds)
+        given = counts if self.if_short == "keep" else wanted
+        rows = self.sample(cloud, counts, seeds)
+        if given != counts:
+            rows = self._fill_up(rows, counts, given, seeds)
+        return rows, ptr_from_counts(given, device=cloud.device)
 
     def _counts(self, cloud: PointCloud, wanted: list[int], available: list[int]) -> list[int]:
         """Return how many of the wanted rows each cloud has; refuse a short one if that is asked."""
@@ -149,12 +153,6 @@ class _Sample(SelectTransform, abstract=True):
                     f"{want} asked; ask for fewer (num_points)" + ("" if have == 0 else ", or choose if_short")
                 )
         return [min(pair) for pair in zip(wanted, available)]
-
-    def _filled(self, rows: Tensor, counts: list[int], wanted: list[int], seeds: list[int]) -> tuple[Tensor, Tensor]:
-        """Return as many rows as are wanted, and where each cloud begins among them."""
-        if counts == wanted or self.if_short == "keep":
-            return rows, ptr_from_counts(counts, device=rows.device)
-        return self._fill_up(rows, counts, wanted, seeds), ptr_from_counts(wanted, device=rows.device)
 
     def transform(self, data: PointCloud, params: Params) -> PointCloud:
         """Select the rows and blank those marked -1."""
@@ -252,9 +250,11 @@ class FarthestPointSample(_FarthestPoints):
         """Sample among some rows."""
         wanted, no_seeds = [self.num_points] * data.num_clouds, [0] * data.num_clouds
         counts = self._counts(data, wanted, counts_of(ptr))
-        found = farthest_rows_within(data.points.detach(), ptr, within, counts)
-        (index, picked_ptr), (place, _) = (self._filled(rows, counts, wanted, no_seeds) for rows in found)
-        return {"index": index, "ptr": picked_ptr, "place": place, "place_ptr": ptr}
+        index, place = farthest_rows_within(data.points.detach(), ptr, within, counts)
+        given = counts if self.if_short == "keep" else wanted
+        if given != counts:
+            index, place = (self._fill_up(rows, counts, given, no_seeds) for rows in (index, place))
+        return {"index": index, "ptr": ptr_from_counts(given, device=data.device), "place": place, "place_ptr": ptr}
 
     def fixed_work(self, like: FixedRows) -> Callable[[FixedRows], FixedRows] | None:
         """Sample by place alone, from the first row; a cloud that has too few is left to others."""
