@@ -301,10 +301,11 @@ class RemovePlane(RemoveTransform):
 
     def _surfaces(self, data: PointCloud, params: Params) -> Callable[[], Surfaces]:
         """Return what tells the surfaces of planes: found out when it is asked, where nobody changes the points."""
-        points, ptr, kept, planes = data.points.detach(), data.ptr, params["index"], params["planes"].cpu()
+        points, ptr, kept = data.points.detach(), data.ptr, params["index"]
         if "rms" in params:
             found = surfaces_seen(points, params["corners"], params["rms"])
             return lambda: found
+        planes = params["planes"].cpu()
         return lambda: surfaces_seen(points, *plane_surfaces(points, ptr, negated(kept), planes, self.distance)[1:])
 
     def _judged(self, data: PointCloud, params: Params, b: int, plane: Sequence[float]) -> dict[str, Any]:

@@ -92,7 +92,7 @@ double interleaved_sum(const pc_context& context, int64_t count, Body&& body) {
   return runs > 0 ? run[0] : 0.0;
 }
 
-void mark_outliers(const pc_context& context, const double* mean, int64_t count, double std_ratio, uint8_t* outlier) {
+void mark_outliers(const pc_context& context, const double* mean, int64_t count, double std_ratio, bool* outlier) {
   const double average = interleaved_sum(context, count, [&](int64_t i) { return mean[i]; }) / double(count);
   const double spread = interleaved_sum(context, count, [&](int64_t i) {
     const double off = mean[i] - average;
@@ -149,7 +149,8 @@ PC_EXPORT int32_t pc_statistical_outliers(const pc_context* context, const float
     else
       for (int64_t b = 0; b < num_clouds; ++b) mean_distances(*context, clouds, grid, b, task);
     cells::for_each_cloud(*context, ptr, num_clouds, [&](const pc_context& own, int64_t first, int64_t count) {
-      mark_outliers(own, mean + first, count, std_ratio, marks + first);
+      // As truth values: bytes may lie anywhere, so each store would let the compiler read the means anew.
+      mark_outliers(own, mean + first, count, std_ratio, reinterpret_cast<bool*>(marks) + first);
     });
     if (kept_ptr != nullptr) rows::mark_kept(*context, marks, true, nullptr, ptr, num_clouds, {marks, kept_ptr, sums});
   });
