@@ -108,7 +108,7 @@ def check_text(where: str, names: Iterable[str]) -> None:
     controlling = [name for name in names if _CONTROLS.search(name)]
     if controlling:
         shown = ", ".join(ascii(name[:_LONGEST]) for name in controlling[:_SHOWN])
-        raise CaptureError(f"{where}: names must not have control characters, but {shown}{_more(controlling)}: rename")
+        raise CaptureError(f"{where}: names must not have control characters: rename {shown}{_more(controlling)}")
     broken = [name for name in names if not _is_utf8(name)]
     if broken:
         shown = ", ".join(str(os.fsencode(name)) if _from_bytes(name) else ascii(name) for name in broken[:_SHOWN])
