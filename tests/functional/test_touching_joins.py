@@ -108,3 +108,17 @@ def test_what_was_not_read_between_two_parts_of_a_face_says_nothing(every):
     assert objects.scene.seen_between(between)[3] > 0.1  # of the way nothing is known
     join_occluded(objects)
     assert objects.object_of == [0, 0]
+
+
+@pytest.mark.parametrize("side", [16, 24])
+def test_a_smeared_border_does_not_turn_the_plane_of_a_face(side):
+    # On one side the last columns run toward what is 9 cm behind.
+    depth = torch.full((ROWS, COLUMNS), 0.8, dtype=torch.float64)
+    depth[:, 30 + side - 2 : 30 + side] += torch.tensor([0.03, 0.06])
+    label = torch.full((ROWS, COLUMNS), -1)
+    label[:, 30 - side : 30 + side] = 0
+    face = Objects(scene(1 / depth, torch.zeros_like(depth), label)).face([0])
+    turned = torch.linalg.eigh(torch.cov(face.points.T)).eigenvectors[:, 0]
+    assert abs(float(turned[2])) < math.cos(math.radians(9))
+    assert abs(float(face.normal[2])) > math.cos(math.radians(1))
+    assert face.rms < 0.002
