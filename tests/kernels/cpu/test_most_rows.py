@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import pytest
@@ -9,11 +10,20 @@ import torch
 
 from pcdata.errors import BackendError
 from pcdata.kernels.cpu import native
+from pcdata.kernels.cpu.signatures import DECLARATIONS
 
 pytestmark = pytest.mark.skipif(native.unavailable() is not None, reason="the core is not built")
 
 MOST = 2**31 - 1
 ABSENT = ("limits", "pixel", "camera", "within", "guess", "up", "origins")  # may be null
+DTYPES = {
+    "float*": torch.float32,
+    "double*": torch.float64,
+    "bool*": torch.bool,
+    "uint8*": torch.uint8,
+    "int32*": torch.int32,
+    "int64*": torch.int64,
+}
 FUNCTIONS = (
     "pc_neighbors",
     "pc_index_points",
@@ -31,16 +41,17 @@ FUNCTIONS = (
 )
 
 
-def arguments_of(name: str, rows: int) -> list[Any]:
+def arguments_of(function: str, rows: int) -> list[Any]:
     """One cloud of so many rows that none of the arrays has."""
+    (declared,) = re.findall(rf"^{function}: (.*(?:\n    .*)*)", DECLARATIONS, re.MULTILINE)
     found: list[Any] = []
-    for parameter in native.library()[name].parameters:
-        if parameter.name == "ptr":
+    for kind, name in (argument.split() for argument in declared.replace("\n    ", " ").split(", ")):
+        if name == "ptr":
             found.append(torch.tensor([0, rows]))
-        elif parameter.name in ABSENT:
-            found.append(None if parameter.dtypes else 0)
+        elif name in ABSENT:
+            found.append(None)
         else:
-            found.append(torch.ones(64, dtype=parameter.dtypes[0]) if parameter.dtypes else 1)
+            found.append(torch.ones(64, dtype=DTYPES[kind]) if kind in DTYPES else 1)
     return found
 
 
