@@ -15,9 +15,9 @@ LIMITS = {  # calls, files; counted with Python before 3.12, where comprehension
     # what a step has found is kept for the next, selections are run together, others are asked by name, rays shared
     # of eight steps in five passes; checksums have a file of their own; a plane takes as many rounds as it needs;
     # kernels of outliers and of normals have one each, and so have what both ask of the core, and how passes are run
-    "live": (559, 49),
+    "live": (553, 49),
     "build": (
-        3305,
+        3300,
         118,  # the options have a file of their own, and so do what the core finds of planes, and motions
     ),  # of which 600 keep what a build was when it is stopped, 700 write its card, 30 tell rows, 16 look at poses, 56
     # have the hull and the rows of a plane found by the core, on one thread of torch's, 15 and 2 files tell its surface
