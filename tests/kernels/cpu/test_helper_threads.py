@@ -94,8 +94,15 @@ small, found = points[:60_000], []
 lower, upper = torch.zeros(1, 3), torch.full((1, 3), 0.5)
 inside = ((small >= 0) & (small <= 0.5)).all(1)
 alone = F.estimate_normals(points, max_neighbors=30, backend="cpu")
-signal.signal(signal.SIGALRM, lambda *_: found.append(F.box_mask(small, lower=lower, upper=upper, backend="cpu")))
-signal.setitimer(signal.ITIMER_REAL, 0.01, 0.01)
+
+
+def call_again(*_):
+    found.append(F.box_mask(small, lower=lower, upper=upper, backend="cpu"))
+    signal.setitimer(signal.ITIMER_REAL, 0.01)  # not before this call has ended, however slow it is
+
+
+signal.signal(signal.SIGALRM, call_again)
+signal.setitimer(signal.ITIMER_REAL, 0.01)
 interrupted = F.estimate_normals(points, max_neighbors=30, backend="cpu")
 signal.setitimer(signal.ITIMER_REAL, 0)
 assert found, "the call was too short to be interrupted"
