@@ -75,7 +75,7 @@ class ClusterObjects(DropLimit):
     """
 
     runs_statistics = True
-    version = 3
+    version = 4
 
     eps: Metres = 0.02
     min_points: Count = 50
