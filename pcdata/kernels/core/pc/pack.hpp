@@ -34,6 +34,14 @@ struct Pack {
 
   Scalar operator[](int lane) const { return part[lane / kPerPart][lane % kPerPart]; }
 
+  // All parts made one by `op`.
+  template <class Op>
+  Register combined(const Op& op) const {
+    Register result = part[0];
+    for (int p = 1; p < kParts; ++p) result = op(result, part[p]);
+    return result;
+  }
+
   // The pack whose parts are body(0), body(1), ...
   template <class Body>
   static Pack each(Body&& body) {
@@ -69,6 +77,8 @@ struct Pack {
   friend PackMask less(const Pack& a, const Pack& b) {
     return mask([&](size_t p) { return pc::less_bits(a.part[p], b.part[p]); });
   }
+  // Whether any lane of a is less than that of b.
+  friend bool any_less(const Pack& a, const Pack& b) { return any_less(a, b, std::make_index_sequence<kParts>()); }
   friend PackMask less_equal(const Pack& a, const Pack& b) {
     return mask([&](size_t p) { return pc::less_equal_bits(a.part[p], b.part[p]); });
   }
@@ -80,6 +90,10 @@ struct Pack {
     ((result.part[P] = body(P)), ...);
     return result;
   }
+  template <size_t... P>
+  static bool any_less(const Pack& a, const Pack& b, std::index_sequence<P...>) {
+    return any((pc::less(a.part[P], b.part[P]) | ...));
+  }
   template <class Body, size_t... P>
   static PackMask mask(Body&& body, std::index_sequence<P...>) {
     return ((body(P) << (P * kPerPart)) | ...);
@@ -89,20 +103,30 @@ struct Pack {
 using FloatPack = Pack<float, FloatRegister>;
 using DoublePack = Pack<double, DoubleRegister>;
 
+// Of lanes that are no NaN.
 inline float largest(const FloatPack& a) {
-  float lane[kPackLanes];
-  a.store(lane);
-  for (int width = kPackLanes / 2; width > 0; width /= 2)
-    for (int i = 0; i < width; ++i) lane[i] = lane[i] > lane[i + width] ? lane[i] : lane[i + width];
-  return lane[0];
+  return highest_lane<float>(a.combined([](const auto& b, const auto& c) { return maximum(b, c); }));
+}
+inline float smallest(const FloatPack& a) {
+  return lowest_lane<float>(a.combined([](const auto& b, const auto& c) { return minimum(b, c); }));
 }
 
 inline DoublePack widen(const FloatPack& a) {
-  using Narrow = float __attribute__((vector_size(kRegisterBytes / 2)));
-  constexpr size_t kNarrow = sizeof(Narrow) / sizeof(float);
-  return DoublePack::each([&](size_t p) {
+  return DoublePack::each([&](size_t p) -> DoubleRegister {
+#if defined(PC_AVX512)
+    // Compilers know no other way from half a register than by memory.
+    const __m512 all = native(a.part[0]);
+    return _mm512_maskz_cvtps_pd(kAll8,
+                                 p == 0 ? _mm512_castps512_ps256(all) : _mm512_maskz_extractf32x8_ps(kAll8, all, 1));
+#elif defined(__AVX2__)
+    const auto all = reinterpret_cast<__m256>(a.part[p / 2]);
+    return _mm256_cvtps_pd(p % 2 == 0 ? _mm256_castps256_ps128(all) : _mm256_extractf128_ps(all, 1));
+#else
+    using Narrow = float __attribute__((vector_size(kRegisterBytes / 2)));
+    constexpr size_t kNarrow = sizeof(Narrow) / sizeof(float);
     const auto half = load<Narrow>(reinterpret_cast<const float*>(&a.part[p / 2]) + p % 2 * kNarrow);
     return __builtin_convertvector(half, DoubleRegister);
+#endif
   });
 }
 

@@ -45,7 +45,7 @@ class ImageBoxes {
                        }),
                        most);
       }
-      low[axis] = -largest(FloatPack(0.0f) - least);
+      low[axis] = smallest(least);
       high[axis] = largest(most);
     }
   }

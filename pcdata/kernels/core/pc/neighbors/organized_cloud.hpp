@@ -265,7 +265,7 @@ class OrganizedCloud {
       low = minimum(down, low);
       high = maximum(down, high);
     }
-    line_least = -largest(FloatPack(0.0f) - low);
+    line_least = smallest(low);
     line_most = largest(high);
     return bad == 0;
   }

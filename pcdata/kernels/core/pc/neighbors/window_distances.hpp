@@ -85,7 +85,6 @@ class WindowDistances {
  private:
   static constexpr int64_t kLinesPerPiece = 4;
   static constexpr int kMoreRings = 8;
-  static constexpr int kWorth = 2;             // lanes for which a further ring costs less than searches of their own
   static constexpr int64_t kWorkPerPoint = 4;  // registers of pixels looked at for stragglers, per point of the cloud
 
   // A window of (2 reach + 1)^2 pixels with at least k in it.
@@ -157,14 +156,19 @@ class WindowDistances {
     int reach = first_reach(k_);
     list.start(around);
     if (pixels_around(reach) > List::kSize) list.take(List::kSize, pixels_around(reach), around);
+    const FloatPack farthest = place.clear_within(max_reach(k_));
     for (;;) {
       const FloatPack bound = list.bound();
       const PackMask proved = less(bound, place.clear_within(reach)) & queries.active, open = queries.active & ~proved;
       if (open == 0 || reach == max_reach(k_)) return proved;
-      const PackMask hopeful = less(bound, place.clear_within(max_reach(k_))) & open;
-      const PackMask lost = open & ~less(bound, FloatPack(kInfinity));
-      if (__builtin_popcount(hopeful) < kWorth && lost == 0) return proved;
-      list.take(pixels_around(reach), pixels_around(reach + 1), around);
+      // Even for one lane that can be proved a further ring costs less than a search of its own.
+      const PackMask hopeful = less(bound, farthest) & open, lost = open & ~less(bound, FloatPack(kInfinity));
+      if ((hopeful | lost) == 0) return proved;
+      // Of the second ring most pixels are near to some lane, of those after it few.
+      if (reach == first_reach(k_))
+        list.take(pixels_around(reach), pixels_around(reach + 1), around);
+      else
+        list.take_few(pixels_around(reach), pixels_around(reach + 1), around);
       ++reach;
     }
   }

@@ -50,6 +50,27 @@ class WindowList {
     merge_taken((last - first) / kBlockRows);
   }
 
+  // The same where few are less than the bound: only those that are so in any lane are sorted.
+  template <class Body>
+  [[gnu::noinline]] void take_few(int first, int last, const Body body) {
+    for (int some; first < last; first += some) {
+      some = std::min(last - first, 64);
+      const FloatPack bound = bound_;
+      uint64_t chosen = 0;
+      for (int i = 0; i < some; ++i) chosen |= uint64_t{any_less(each(body, first + i), bound)} << i;
+      while (chosen != 0) {
+        int index[kBlockRows];
+        float floor[kBlockRows];
+        for (int i = 0; i < kBlockRows; ++i) {
+          index[i] = chosen != 0 ? first + __builtin_ctzll(chosen) : first;
+          floor[i] = chosen != 0 ? 0 : kInfinity;
+          chosen &= chosen - 1;
+        }
+        take_block(body, index, floor);
+      }
+    }
+  }
+
   // The largest that is wanted, and the least.
   const FloatPack& bound() const { return bound_; }
   FloatPack least() const { return minimum(FloatPack::load(list_[before()]), FloatPack::load(list_[kSize - 1])); }
@@ -57,6 +78,9 @@ class WindowList {
   const Row* squared() const { return list_ + before(); }
 
  private:
+  template <int>
+  friend class WindowList;
+
   // One register of each of kSize distances, ascending.
   struct Sorted {
     FloatRegister v[kSize];
@@ -102,6 +126,22 @@ class WindowList {
   void sort_list() {
     if (!is_sorted_) NetworkOf<Network::kMerging, kSize>::run(list_);
     is_sorted_ = true;
+  }
+
+  // Take a block of distances, where they are not less than the floor.
+  template <class Body>
+  [[gnu::always_inline]] void take_block(const Body& body, const int* index, const float* floor) {
+    sort_list();
+    for_registers([&](int lane) __attribute__((always_inline)) {
+      const auto at_least_floor = [&](int i, int own_lane) __attribute__((always_inline)) {
+        return maximum(body(index[i], own_lane), floor[i] - FloatRegister{});
+      };
+      typename WindowList<1>::Sorted sorted(at_least_floor, 0, lane);
+      FloatRegister most = sorted.merge(list_ + kSize - kBlockRows, lane);
+      if constexpr (kBlocks > 1) most = maximum(most, load<FloatRegister>(list_[kSize - kBlockRows - 1] + lane));
+      store(&bound_.part[lane / kLanes], most);
+    });
+    is_sorted_ = false;
   }
 
   [[gnu::noinline]] void merge_taken(int blocks) {
