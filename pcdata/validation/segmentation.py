@@ -197,6 +197,11 @@ def _check(predicted: Tensor, true: Tensor, ignore: Tensor | None) -> None:
 
 def _numbered(labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the labels of objects in rising order, and the image of their numbers 1, 2, ...; 0 = none."""
+    if labels.max(initial=-1) < labels.size:  # counted in a fraction of the time that sorting takes
+        place = np.maximum(labels, -1) + 1
+        is_there = np.bincount(place.ravel(), minlength=1) > 0
+        is_there[0] = False
+        return np.flatnonzero(is_there) - 1, np.where(is_there, is_there.cumsum(), 0)[place]
     ids, number = np.unique(labels, return_inverse=True)
     first = int((ids < 0).sum())
     return ids[first:], np.maximum(number.reshape(labels.shape) + 1 - first, 0)
@@ -241,7 +246,7 @@ def _num_near(edge: NDArray[np.bool_], other: NDArray[np.bool_], reach: int) -> 
     """Count the pixels of an edge that lie within ``reach`` pixels of the other."""
     from scipy.spatial import cKDTree  # imported late: only this function needs it
 
-    pixels, targets = np.argwhere(edge), np.argwhere(other)
+    pixels, targets = (np.column_stack(np.divmod(np.flatnonzero(one), one.shape[1])) for one in (edge, other))
     if not len(pixels) or not len(targets):
         return 0
     distance, _ = cKDTree(targets).query(pixels)

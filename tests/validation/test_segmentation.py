@@ -179,3 +179,12 @@ def test_a_cloud_is_scored_against_an_organized_cloud_with_parts(tmp_path):
         matched_labels(type(short)(short.path, short.labels[1:], short.place[1:], None), true)
     with pytest.raises(ConfigError, match="must end in"):
         read_label_file(tmp_path / "labels.txt")
+
+
+def test_labels_of_any_size_score_alike():
+    small = torch.randint(-2, 5, (2, 40, 60), generator=torch.Generator().manual_seed(0))
+    large = torch.where(small >= 0, small * 10**12 + 7, -(10**9))
+    few, many = (score_segmentation(*pair) for pair in (small, large))
+    assert [many.overlap_f, many.boundary_f, many.mean_iou] == [few.overlap_f, few.boundary_f, few.mean_iou]
+    assert [one.label for one in few.objects] == [0, 1, 2, 3, 4]
+    assert [one.label for one in many.objects] == [k * 10**12 + 7 for k in range(5)]
