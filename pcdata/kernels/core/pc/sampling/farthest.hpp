@@ -168,7 +168,7 @@ class FarthestSampler {
     for (uint32_t rest = reached; rest != 0; rest &= rest - 1) {
       const int64_t child = index * kFan + __builtin_ctz(rest);
       if (at == 0)
-        __builtin_prefetch(&leaves_[child]);  // the rest follows by itself
+        prefetch(leaves_[child]);
       else
         prefetch(levels_[at - 1].groups[child]);
     }
