@@ -122,3 +122,52 @@ def test_a_smeared_border_does_not_turn_the_plane_of_a_face(side):
     assert abs(float(turned[2])) < math.cos(math.radians(9))
     assert abs(float(face.normal[2])) > math.cos(math.radians(1))
     assert face.rms < 0.002
+
+
+def cup_in_parts(*, before: float = 0.06) -> Objects:
+    """Look straight down at a cone of normals that lean inward: its bottom 0, and around it halves 1 and 2, 3 beside.
+
+    The bottom has joined half 1, whose top lies so many metres above the table; the contacts with half 2 are strong.
+    """
+    rows_, columns = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in (ROWS, COLUMNS)), indexing="ij")
+    x, y = columns - CAMERA.cx, rows_ - CAMERA.cy
+    away = (x * x + y * y).sqrt()
+    label = torch.full((ROWS, COLUMNS), 3)
+    label[away < 18] = 1
+    label[(away < 18) & (x > 0)] = 2
+    label[away < 12] = 0
+    inside = label == 0
+    depth = torch.where(inside, 0.81 - 0.005 * away / 12, 0.80)
+    normal = torch.stack([-0.5 * x / away.clamp(min=1), -0.5 * y / away.clamp(min=1), -torch.ones_like(x)], -1)
+    normal = torch.where(inside[..., None], normal / normal.norm(dim=-1, keepdim=True), torch.tensor([0.0, 0.0, -1.0]))
+    height = torch.where(inside, 0.04, 0.06)
+    height[label == 1] = before
+    pixel = torch.arange(ROWS * COLUMNS).reshape(ROWS, COLUMNS)
+    pairs = [(label[:, :-1], label[:, 1:], pixel[:, :-1], pixel[:, 1:]), (label[:-1], label[1:], pixel[:-1], pixel[1:])]
+    first, second = (torch.cat([one[place][one[0] != one[1]] for one in pairs]) for place in (2, 3))
+    contacts = Contacts(first, second, torch.ones(len(first), dtype=torch.float64))
+    objects = Objects(Scene(1 / depth, label, normal, height, contacts, CAMERA, KINECT_NOISE, Limits()))
+    objects.join(0, 1)
+    return objects
+
+
+def test_what_encloses_an_inside_is_its_wall_though_it_has_joined_a_part_of_it():
+    objects = cup_in_parts()
+    assert objects.scene.sides(0)[0] == objects.scene.sides(0)[1] == objects.scene.sides(0)[4] == 0
+    join_hollows(objects)
+    assert objects.object_of == [0, 0, 0, 3]
+    assert objects.joins == [(0, "hollow")]
+
+
+def test_it_is_not_where_a_part_of_what_encloses_it_is_lower():
+    objects = cup_in_parts(before=0.03)
+    join_hollows(objects)
+    assert objects.object_of == [0, 0, 2, 3]
+    assert not objects.joins
+
+
+def test_sides_are_counted_at_the_border_of_the_image_too():
+    label = torch.tensor([[0, 0, 1], [-1, 0, 1]])
+    found = scene(torch.ones(2, 3, dtype=torch.float64), torch.zeros(2, 3, dtype=torch.float64), label)
+    assert found.sides(0) == [6, 0, 2]
+    assert found.sides(1) == [4, 2, 0]

@@ -62,6 +62,15 @@ class Scene:
         pixels = self.pixels[regions[0]] if len(regions) == 1 else torch.cat([self.pixels[r] for r in regions])
         return Face(self, pixels)
 
+    def sides(self, region: int) -> list[int]:
+        """Return how many sides of a region's pixels lie at no region, at region 0, 1, ..."""
+        width = self.label.shape[1] + 2
+        label = torch.nn.functional.pad(self.label, (1, 1, 1, 1), value=-1).flatten()
+        pixels = self.pixels[region]
+        place = (pixels // (width - 2) + 1) * width + pixels % (width - 2) + 1
+        beside = torch.cat([label[place + step] for step in (-width, -1, 1, width)])
+        return torch.bincount(beside[beside != region] + 1, minlength=self.num_regions + 1).tolist()
+
     def highest_up_ramps(self, pixels: Tensor) -> Tensor:
         """Return the largest height in their regions that ramps lead to from pixels (n,): the pixels' own, or more.
 

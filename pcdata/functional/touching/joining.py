@@ -26,6 +26,7 @@ _CONTACT_PIXELS = 5  # fewer are no contact
 # and boxes and cylinders seen from outside less than 0.
 _HOLLOW_RISE, _HOLLOW_PART, _NOT_CONVEX = 0.06, 0.6, -0.05
 _RIM, _WALL_RIM, _WITHIN = 0.015, 0.02, 0.015  # metres
+_ENCLOSED = 0.9  # part of its border along which an inside must meet higher regions for all of them to be its wall
 # Two parts of one face: their planes turn less than 14 degrees, and each other's middle is off by less than 3 cm; one
 # plane fits both nearly as well as each its own; they are beside each other, within 25 cm; and the way from one to the
 # other is hidden. Where they touch it is seen, and all is stricter; pixels without a reading say nothing, up to half.
@@ -102,6 +103,18 @@ class Objects:
         own = lookup[self.scene.label.flatten().cpu()[first]] == of
         return torch.where(own, first, second), torch.where(own, second, first)
 
+    def border_of(self, region: int) -> dict[int, tuple[torch.Tensor, torch.Tensor]]:
+        """Return for every region in contact with one: the pixels of that one, and their neighbors in the other."""
+        flat = self.scene.label.flatten().cpu()
+        found = {}
+        for pair, rows in self._rows.items():
+            if region not in pair:
+                continue
+            first, second = self.scene.contacts.first.cpu()[rows], self.scene.contacts.second.cpu()[rows]
+            own = flat[first] == region
+            found[sum(pair) - region] = torch.where(own, first, second), torch.where(own, second, first)
+        return found
+
 
 def merge_weak_contacts(objects: Objects) -> None:
     """Join the two objects with the weakest contact, until every contact is strong; contacts grow as objects do."""
@@ -157,6 +170,36 @@ def join_hollows(objects: Objects) -> None:
                 objects.join(start, other, "hollow")
                 if is_inside:
                     todo.append(other)
+    _join_enclosing(objects, depth)
+
+
+def _join_enclosing(objects: Objects, depth: torch.Tensor) -> None:
+    """Join the regions that enclose the inside of a cup, though it is an object with one of them already.
+
+    Of a small inside the bottom alone is a region, and what stands around it reaches from there over the rim to the
+    outer wall; no contact of the two is weak, and the inside does not show in what it has joined.
+    """
+    beside: dict[int, set[int]] = {}
+    for a, b in objects.sums:
+        beside.setdefault(a, set()).add(b)
+        beside.setdefault(b, set()).add(a)
+    for region, others in sorted(beside.items()):
+        if len({objects.object_of[one] for one in others} | {objects.object_of[region]}) == 1:
+            continue
+        inside = objects.face([region])
+        if not _is_hollow(inside):
+            continue
+        wall, sides = [], objects.scene.sides(region)
+        for other, (own, next_to) in objects.border_of(region).items():
+            part = objects.face([other])
+            behind = float((depth[next_to] - depth[own]).median())
+            if len(own) < _CONTACT_PIXELS or behind >= objects.scene.noise * float(depth[own].median()) ** 2:
+                continue
+            if part.top > inside.top:
+                wall.append(other)
+        if sum(sides[1 + one] for one in wall) > _ENCLOSED * sum(sides):
+            for other in wall:
+                objects.join(region, other, "hollow")
 
 
 def _is_hollow(face: Face) -> bool:
