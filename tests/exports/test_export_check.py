@@ -142,7 +142,7 @@ def test_exports_of_files_for_every_sample_are_judged_as_they_were_exported(caps
         assert main(["check", str(folder), "--model", model, "--frame", "base"]) == 0
         assert "PASS: of 3 captures 3 pass" in capsys.readouterr().out
         assert main(["check", str(folder / part), "--model", model, "--frame", "base"]) == 0
-        assert "of 1 captures" in capsys.readouterr().out
+        assert "of 1 capture 1 pass" in capsys.readouterr().out
         (folder / broken).write_bytes(b"nothing")
         with pytest.raises(CacheError, match=f"{broken}: "):
             check_export(folder, model)
@@ -185,12 +185,13 @@ def test_a_record_that_is_not_whole_is_told(capsys, tmp_path, change, message):
 
 def test_files_of_others_name_the_candidates(capsys, tmp_path):
     (dp3(tmp_path / "out") / FILE_NAME).unlink()
+    (tmp_path / "out/data/point_cloud").rename(tmp_path / "out/data/xyz")
     np.savez(tmp_path / "a.npz", xyz=np.zeros((3, 3)), rgb=np.zeros((3, 3)))
     np.save(tmp_path / "a.npy", np.zeros((3, 3)))
     with h5py.File(tmp_path / "a.h5", "w") as file:
         file["clouds/xyz"] = np.zeros((3, 3))
     for name, words in {
-        "out": "it has data/action, data/img, data/point_cloud, data/state, meta/episode_ends",
+        "out": "it has data/action, data/img, data/state, data/xyz, meta/episode_ends",
         "a.npz": "it has rgb, xyz",
         "a.h5": "it has clouds/xyz",
         "a.npy": "it is one array, without a name: --keys points=",

@@ -15,7 +15,7 @@ from pcdata.build import BuildConfig, build_dataset, config_from_yaml
 from pcdata.build.model_section import stored_preset
 from pcdata.cli.main import main
 from pcdata.datasets import CachedCloudDataset, CloudDataset
-from pcdata.errors import CacheError, CaptureError, ConfigError
+from pcdata.errors import CacheError, ConfigError
 from pcdata.exports import TARGETS, check_export, export_dataset, targets_of
 from pcdata.exports.export_record import FILE_NAME
 from pcdata.models import CONTRACTS, Preset, preset
@@ -203,5 +203,8 @@ def test_a_teleoperated_set_goes_through_build_and_export_with_its_signals_and_t
         state = np.concatenate([signals[key].values[0].numpy() for key in ("joints", "gripper")])
         assert np.array_equal(buffer["state"][row], state)
         assert np.array_equal(buffer["action"][row], signals["action"].values[0].numpy())  # of base, in base
-    with pytest.raises(CaptureError, match=r"must be a row of numbers, but the signal 'hand' is of shape \(4, 4\)"):
-        export_dataset(tmp_path / "built", "dp3", tmp_path / "matrix", state="hand")
+    export_dataset(tmp_path / "built", "dp3", tmp_path / "pose", state="hand")  # position, two columns of the rotation
+    for row, name in enumerate(source.ids):
+        hand = source.signals(name)["hand"].values[0].numpy()
+        expected = np.concatenate([hand[:3, 3], hand[:3, 0], hand[:3, 1]])
+        assert replay_buffer(tmp_path / "pose")["state"][row] == pytest.approx(expected, abs=1e-6)
