@@ -36,7 +36,7 @@ from pcdata.exports import TARGETS, export_dataset
 from pcdata.functional import ParallelJaw, tsdf  # noqa: F401
 from pcdata.functional.stored_rows import Role, StoredForm, StoredGroups, find_records, parts_of  # noqa: F401
 from pcdata.functional.touching.limits import Limits  # noqa: F401
-from pcdata.functional.touching.regions import PixelCamera  # noqa: F401
+from pcdata.functional.touching.windows import PixelCamera  # noqa: F401
 from pcdata.io import (  # noqa: F401
     AveragedSource,
     CaptureCamera,

@@ -32,7 +32,7 @@ from torch import Tensor
 
 import pcdata
 from pcdata.functional import ParallelJaw, check_grasps
-from pcdata.functional.touching import joining, separation
+from pcdata.functional.touching import joining, regions, separation
 from pcdata.functional.touching.limits import Limits
 from pcdata.io import open_source, read_labels, read_pcd
 from pcdata.report import text_table
@@ -327,6 +327,12 @@ def nothing(objects: Any) -> None:
     """Stand in for a step that is left out."""
 
 
+def uncut(*arguments: Any, backend: str) -> regions.Regions:
+    """Find regions that reach over lines which are too steep."""
+    with mock.patch.object(regions, "cut_where_steep", lambda inverse, label, *_: label):
+        return regions.smooth_regions(*arguments, backend="torch")
+
+
 NEVER = {"gap_from": 1e6, "gap_full": 2e6}
 ABLATIONS: dict[str, dict[str, Any]] = {
     "full": {},
@@ -336,6 +342,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "steps alone, no creases": {"angle_from": 3.0, "angle_full": 4.0},
     "creases alone, no steps": NEVER,
     "convex creases do not bound regions": {"convex_part": 0.0},
+    "no cuts where regions are steep": {"smooth_regions": uncut},
     "limit 0.2": {"PARTS_FROM": 0.2},
     "limit 0.5": {"PARTS_FROM": 0.5},
 }

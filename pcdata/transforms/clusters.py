@@ -75,7 +75,7 @@ class ClusterObjects(DropLimit):
     """
 
     runs_statistics = True
-    version = 4
+    version = 5
 
     eps: Metres = 0.02
     min_points: Count = 50

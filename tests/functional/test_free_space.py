@@ -12,7 +12,7 @@ from pcdata.functional.touching.chords import Sight, free_chords
 from pcdata.functional.touching.contacts import Contacts
 from pcdata.functional.touching.faces import Scene
 from pcdata.functional.touching.limits import KINECT_NOISE, Limits
-from pcdata.functional.touching.regions import PixelCamera
+from pcdata.functional.touching.windows import PixelCamera
 
 CAMERA = PixelCamera(100.0, 100.0, 49.5, 49.5)
 

@@ -6,7 +6,7 @@ import torch
 
 from pcdata.functional.touching.limits import KINECT_NOISE, RAMP, Limits
 from pcdata.functional.touching.ramps import sharpened
-from pcdata.functional.touching.regions import PixelCamera
+from pcdata.functional.touching.windows import PixelCamera
 
 CAMERA = PixelCamera(600.0, 600.0, 40.0, 30.0)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from pcdata.functional.touching.contacts import Contacts
 from pcdata.functional.touching.faces import Scene
 from pcdata.functional.touching.joining import Objects, join_hollows, join_occluded
 from pcdata.functional.touching.limits import KINECT_NOISE, RAMP, Limits
-from pcdata.functional.touching.regions import PixelCamera
+from pcdata.functional.touching.windows import PixelCamera
 
 CAMERA = PixelCamera(500.0, 500.0, 29.5, 19.5)
 ROWS, COLUMNS = 40, 60
@@ -96,6 +97,18 @@ def test_the_parts_of_a_small_inside_are_one_and_those_of_a_ball_stay(radius):
         assert objects.face([0]).area < 2.2e-3
         join_hollows(objects)
         assert objects.object_of == ([0, 0] if hollow else [0, 1])
+
+
+@pytest.mark.parametrize("radius", [0.016, 0.02, 0.03])
+def test_a_smeared_rim_does_not_hide_that_an_inside_is_hollow(radius):
+    clear = cup(radius)
+    smeared = clear.normals.clone()
+    rim = (clear.label >= 0) & (clear.inverse < clear.inverse[clear.label >= 0].quantile(0.4))
+    lean = math.radians(80)
+    smeared[rim] = torch.tensor([0.0, math.sin(lean), -math.cos(lean)], dtype=torch.float64)
+    label = torch.where(clear.label >= 0, 0, -1)
+    faces = [Objects(replace(clear, label=label, normals=one)).face([0]) for one in (clear.normals, smeared)]
+    assert all(face.hollow[0] > 0.2 and face.hollow[1] > 0.95 for face in faces)
 
 
 @pytest.mark.parametrize("every", [2, 4])

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
 from pcdata.functional.touching.limits import CONTACT_PIXELS, Limits
-from pcdata.functional.touching.regions import PixelCamera, PlaneSums, dot, in_pixels, length, plane_normal, spread
+from pcdata.functional.touching.windows import PixelCamera, PlaneSums, dot, in_pixels, length, plane_normal, spread
 
 
 class Contacts(NamedTuple):

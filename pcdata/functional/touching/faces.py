@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pcdata.functional.touching.contacts import Contacts
 from pcdata.functional.touching.limits import RAMP, Limits
-from pcdata.functional.touching.regions import PixelCamera
+from pcdata.functional.touching.windows import PixelCamera
 
 _SAMPLE = 150  # points of a face that distances are taken between
 _FITTED = 4000  # points that a plane is fitted to
@@ -185,19 +185,24 @@ class Face:
     def hollow(self) -> tuple[float, float]:
         """Return how far the points rise over each other's tangent planes: mean sine, and the part that rises at all.
 
-        Positive of a surface that is concave as a whole: the inside of a bowl, seen from above.
+        Positive of a surface that is concave as a whole: the inside of a bowl, seen from above. Without the points
+        whose surface leans more than any that is followed: there a sensor smears a rim toward what is behind it.
         """
-        count = len(self.pixels)
-        turn = torch.arange(1500, dtype=torch.int64, device=self.pixels.device)
+        normals, points = self.scene.normals.reshape(-1, 3)[self.pixels], self.points
+        faces = -(normals * points).sum(1) > math.cos(math.atan(self.scene.limits.slope)) * points.norm(dim=1)
+        normals, points = normals[faces], points[faces]
+        count = len(points)
+        if count == 0:
+            return 0.0, 0.0
+        turn = torch.arange(1500, dtype=torch.int64, device=points.device)
         # Two strides that are prime: pairs from all over the face, the same on every device.
         one, other = turn * 7919 % count, (turn * 104729 + count // 2) % count
-        normal = self.scene.normals.reshape(-1, 3)[self.pixels[one]]
-        way = self.points[other] - self.points[one]
+        way = points[other] - points[one]
         length = way.norm(dim=1)
-        usable = (length > 0.01) & (normal != 0).any(1)
+        usable = length > 0.01
         if int(usable.sum()) < 100:
             return 0.0, 0.0
-        rise = ((normal * way).sum(1) / length.clamp(min=1e-9))[usable]
+        rise = ((normals[one] * way).sum(1) / length.clamp(min=1e-9))[usable]
         return float(rise.mean()), float((rise > 0).double().mean())
 
     def joint_rms(self, other: Face) -> float:

@@ -34,7 +34,7 @@ class Limits(NamedTuple):
     gate: float = 8.0
     # Between two normals that are compared no step may be larger.
     step: float = 6.0
-    # Tangent of the steepest surface that is followed: 72 degrees from facing the camera.
+    # Tangent of the steepest surface that is followed: 72 degrees from facing the camera. Regions are cut where more is.
     slope: float = 3.15
     # A full crease: 40 degrees between the normals. Convex ones count half: an object has them itself.
     full_crease: float = chord(40)
@@ -62,6 +62,8 @@ SMOOTH = (1.0, 1.5, 2.0)
 LEVELS = 24
 # Pixels that windows reach: enough to fit a plane, and no more than is worth the time.
 NORMAL_PIXELS = (3, 14)
+# Where it is looked whether a surface is too steep they are narrower, to lie on the ramp that a smeared jump is.
+STEEP_PIXELS = (3, 4)
 CREASE_PIXELS = (2, 12)
 CONTACT_PIXELS = (5, 16)
 # Steps that a jump may be smoothed over: stereo matching by windows makes ramps of a dozen.

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pcdata.functional.touching.limits import RAMP, Limits
-from pcdata.functional.touching.regions import PixelCamera
+from pcdata.functional.touching.windows import PixelCamera
 
 
 def sharpened(inverse: Tensor, camera: PixelCamera, noise: float, limits: Limits) -> Tensor:

@@ -14,8 +14,10 @@ from pcdata.functional.touching.contacts import region_contacts
 from pcdata.functional.touching.faces import Scene
 from pcdata.functional.touching.joining import REASONS, Objects, join_hollows, join_occluded, merge_weak_contacts
 from pcdata.functional.touching.limits import KINECT_NOISE, Limits
+from pcdata.functional.touching.parts import parted_at_jumps
 from pcdata.functional.touching.ramps import sharpened
-from pcdata.functional.touching.regions import PixelCamera, parted_at_jumps, smooth_regions
+from pcdata.functional.touching.regions import smooth_regions
+from pcdata.functional.touching.windows import PixelCamera
 
 _NOISE_STEP = 3  # pixels: neighbors share noise, and whole steps of the sensor
 _NOISE_FACTOR = 1.75  # of the table's noise to that of second differences over 3 pixels, on 45 tables of a Kinect

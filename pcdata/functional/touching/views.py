@@ -19,8 +19,8 @@ from pcdata.functional.touching.chords import Sight, free_chords
 from pcdata.functional.touching.contraction import Edge, contracted
 from pcdata.functional.touching.joining import Objects, join_hollows, merge_weak_contacts
 from pcdata.functional.touching.limits import KINECT_NOISE, Limits
-from pcdata.functional.touching.regions import spread
 from pcdata.functional.touching.separation import Cut, Join, Separation, in_order_of_rows, regions_of
+from pcdata.functional.touching.windows import spread
 
 # Metres, at the noise of a Kinect: surfaces that two views saw in one cell of this edge are the same surface.
 _CELL = 0.01

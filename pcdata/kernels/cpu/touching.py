@@ -8,7 +8,8 @@ from torch import Tensor
 import pcdata.functional.touching  # noqa: F401 - the functions must be registered before their kernels
 from pcdata.contracts.dispatch import kernel
 from pcdata.functional.touching.limits import Limits
-from pcdata.functional.touching.regions import PixelCamera, Regions, spread
+from pcdata.functional.touching.regions import Regions
+from pcdata.functional.touching.windows import PixelCamera, spread
 from pcdata.kernels.cpu.native import call, room_for
 
 

@@ -7,7 +7,8 @@ import torch
 
 from pcdata.functional.touching.contacts import region_contacts, region_planes
 from pcdata.functional.touching.limits import KINECT_NOISE, Limits
-from pcdata.functional.touching.regions import PixelCamera, smooth_regions
+from pcdata.functional.touching.regions import smooth_regions
+from pcdata.functional.touching.windows import PixelCamera, is_steep, rays, window_planes
 
 
 def heap(seed: int, noise: float) -> torch.Tensor:
@@ -49,6 +50,21 @@ def test_regions_and_contacts_equal_the_reference(seed, noise, roughest):
     )
     assert len(expected.first) > 0
     assert all(map(torch.equal, own, expected))
+
+
+@pytest.mark.parametrize("length", [10, 14, 20])
+def test_regions_are_cut_over_smeared_steps_as_in_the_reference(length):
+    part = ((torch.arange(64.0, dtype=torch.float64) - 30) / length).clamp(0, 1)
+    inverse = (1 + 0.15 * part * part * (3 - 2 * part)).expand(50, 64) + 0.1 * (heap(2, KINECT_NOISE) > 0)
+    planes = window_planes(inverse, inverse > 0, torch.full_like(inverse, 4), CAMERA, KINECT_NOISE, Limits())
+    rows, columns = rays(inverse.shape, CAMERA, inverse.device)
+    assert 0 < int(is_steep(planes, columns, rows, CAMERA, Limits()).sum()) < inverse.numel()
+    own, expected = (
+        smooth_regions(inverse, CAMERA, KINECT_NOISE, Limits(seed_area=4e-5), backend=backend).label
+        for backend in ("cpu", "torch")
+    )
+    assert int(expected.max()) > 1
+    assert torch.equal(own, expected)
 
 
 def test_an_image_of_one_pixel_and_one_without_readings_have_no_region():

@@ -24,7 +24,8 @@ struct Camera {
 
 constexpr int kLevels = 24;
 constexpr double kSmooth[3] = {1, 1.5, 2};  // times the limit
-constexpr double kNormalPixels[2] = {3, 14}, kCreasePixels[2] = {2, 12}, kContactPixels[2] = {5, 16};
+constexpr double kNormalPixels[2] = {3, 14}, kSteepPixels[2] = {3, 4};
+constexpr double kCreasePixels[2] = {2, 12}, kContactPixels[2] = {5, 16};
 constexpr int64_t kRows = 8;  // image rows that a thread takes at once
 
 double in_pixels(double length, const Camera& camera, double inverse, const double* bounds) {
@@ -65,16 +66,17 @@ Plane solve(double n, double u, double v, double uu, double uv, double vv, doubl
   return {right, down, (mean_d - right * mean_u) - down * mean_v, mean_u, mean_v, found};
 }
 
-// The unit normal toward the camera of a plane that is `middle` on the ray (x, y, 1).
-void plane_normal(const Plane& plane, double middle, double x, double y, const Camera& camera, double* normal) {
+// The vector across a plane that is `middle` on the ray (x, y, 1), away from the camera, and its length.
+struct Across {
+  double x, y, z, length;
+};
+Across across_plane(const Plane& plane, double middle, double x, double y, const Camera& camera) {
   const double ax = plane.right * camera.fx, ay = plane.down * camera.fy;
   const double az = (middle - ax * x) - ay * y;
-  const double length = std::sqrt((ax * ax + ay * ay) + az * az);
-  const double safe = length > 0 ? length : 1;
-  normal[0] = -ax / safe, normal[1] = -ay / safe, normal[2] = -az / safe;
+  return {ax, ay, az, std::sqrt((ax * ax + ay * ay) + az * az)};
 }
 
-// -- normals ------------------------------------------------------------------------------------------------------
+// -- planes around every pixel ------------------------------------------------------------------------------------
 
 struct Offset {
   int64_t down, right;
@@ -107,7 +109,9 @@ void add_offset(const double* own, const double* other, const double* reach, int
   }
 }
 
-void window_normals(const pc_context& context, const Image& image, double* normals) {
+// Fit a plane around every pixel and pass it on: body(pixel, x, y, plane, its 1/z at the pixel).
+template <class Body>
+void window_planes(const pc_context& context, const Image& image, const double* bounds, Body&& body) {
   const Limits& limits = *image.limits;
   const int64_t width = image.width;
   const double gate = limits.gate * image.noise, steepness = limits.slope / image.camera.fx;
@@ -117,15 +121,13 @@ void window_normals(const pc_context& context, const Image& image, double* norma
     double* sums[kSums];
     for (int64_t row = begin; row < end; ++row) {
       const double* own = image.inverse + row * width;
-      double* normal = normals + 3 * row * width;
-      std::fill_n(normal, 3 * width, 0.0);
       int64_t first = 0, last = width;
       while (first < last && !(own[first] > 0)) ++first;
       while (last > first && !(own[last - 1] > 0)) --last;
       if (first == last) continue;
       double most = 0;
       for (int64_t c = first; c < last; ++c) {
-        reach[c] = in_pixels(limits.normal_reach * image.scale, image.camera, own[c], kNormalPixels);
+        reach[c] = in_pixels(limits.normal_reach * image.scale, image.camera, own[c], bounds);
         if (own[c] > 0) most = std::max(most, reach[c]);
       }
       std::fill_n(buffer.data(), width * kSums, 0.0);
@@ -149,11 +151,33 @@ void window_normals(const pc_context& context, const Image& image, double* norma
         const double* b = buffer.data() + c;
         const Plane plane = solve(b[0], b[width], b[2 * width], b[3 * width], b[4 * width], b[5 * width], b[6 * width],
                                   b[7 * width], b[8 * width]);
-        if (plane.found)
-          plane_normal(plane, own[c] + plane.middle, image.x(c), image.y(row), image.camera, normal + 3 * c);
+        if (plane.found) body(row * width + c, image.x(c), image.y(row), plane, own[c] + plane.middle);
       }
     }
   });
+}
+
+void window_normals(const pc_context& context, const Image& image, double* normals) {
+  std::fill_n(normals, 3 * image.size(), 0.0);
+  window_planes(context, image, kNormalPixels,
+                [&](int64_t pixel, double x, double y, const Plane& plane, double middle) {
+                  const Across across = across_plane(plane, middle, x, y, image.camera);
+                  const double safe = across.length > 0 ? across.length : 1;
+                  double* normal = normals + 3 * pixel;
+                  normal[0] = -across.x / safe, normal[1] = -across.y / safe, normal[2] = -across.z / safe;
+                });
+}
+
+// Mark where planes lean more from facing the camera than any surface that is followed.
+void mark_steep(const pc_context& context, const Image& image, uint8_t* steep) {
+  std::fill_n(steep, image.size(), 0);
+  const double slope = image.limits->slope, least = 1 / std::sqrt(1 + slope * slope);
+  window_planes(context, image, kSteepPixels,
+                [&](int64_t pixel, double x, double y, const Plane& plane, double middle) {
+                  const double length = across_plane(plane, middle, x, y, image.camera).length;
+                  const double ray = std::sqrt((x * x + y * y) + 1);
+                  steep[pixel] = middle < (least * length) * ray;
+                });
 }
 
 // -- creases ------------------------------------------------------------------------------------------------------
@@ -269,8 +293,10 @@ void jumps(const Image& image, int64_t stride, double limit, uint8_t* closed) {
 
 class Flood {
  public:
+  // Without creases (null) all is one level.
   Flood(const Image& image, const double* crease, const uint8_t* across, const uint8_t* along, int64_t* label)
       : image_(image), across_(across), along_(along), label_(label), level_(static_cast<size_t>(image.size())) {
+    if (crease == nullptr) return;
     for (int64_t p = 0; p < image.size(); ++p)
       level_[static_cast<size_t>(p)] = static_cast<uint8_t>(std::floor(crease[p] * kLevels));
   }
@@ -326,26 +352,24 @@ class Flood {
     }
   }
 
-  // Let the labels take what they reach: without jumps through every level, then over jumps. In each round all pixels
-  // that are reached take the lowest label beside them, as it was before the round.
-  void run(Poll& poll) {
-    for (const bool over_jumps : {false, true}) {
-      over_jumps_ = over_jumps;
-      for (auto& waiting : waiting_) waiting.clear();
-      queued_.assign(static_cast<size_t>(image_.size()), 0);
-      for (int64_t p = 0; p < image_.size(); ++p)
-        if (label_[p] >= 0) offer_beside(p);
-      for (int now = 0; now <= kLevels; ++now) {
-        poll.check();
-        auto& round = waiting_[now];
-        while (!round.empty()) {
-          taken_.resize(round.size());
-          for (size_t i = 0; i < round.size(); ++i) taken_[i] = lowest_beside(round[i]);
-          reached_.swap(round);
-          round.clear();
-          for (size_t i = 0; i < reached_.size(); ++i) label_[reached_[i]] = taken_[i];
-          for (const int64_t p : reached_) offer_beside(p, now);
-        }
+  // Let the labels take what they reach over open borders, or over all, level by level. In each round all pixels that
+  // are reached take the lowest label beside them, as it was before the round.
+  void run(Poll& poll, bool over_all) {
+    over_all_ = over_all;
+    for (auto& waiting : waiting_) waiting.clear();
+    queued_.assign(static_cast<size_t>(image_.size()), 0);
+    for (int64_t p = 0; p < image_.size(); ++p)
+      if (label_[p] >= 0) offer_beside(p);
+    for (int now = 0; now <= kLevels; ++now) {
+      poll.check();
+      auto& round = waiting_[now];
+      while (!round.empty()) {
+        taken_.resize(round.size());
+        for (size_t i = 0; i < round.size(); ++i) taken_[i] = lowest_beside(round[i]);
+        reached_.swap(round);
+        round.clear();
+        for (size_t i = 0; i < reached_.size(); ++i) label_[reached_[i]] = taken_[i];
+        for (const int64_t p : reached_) offer_beside(p, now);
       }
     }
   }
@@ -354,10 +378,10 @@ class Flood {
   template <class Body>
   void beside(int64_t p, Body&& body) const {
     const int64_t width = image_.width, row = p / width, c = p % width;
-    if (c > 0 && (over_jumps_ || !across_[p - 1])) body(p - 1);
-    if (c + 1 < width && (over_jumps_ || !across_[p])) body(p + 1);
-    if (row > 0 && (over_jumps_ || !along_[p - width])) body(p - width);
-    if (row + 1 < image_.height && (over_jumps_ || !along_[p])) body(p + width);
+    if (c > 0 && (over_all_ || !across_[p - 1])) body(p - 1);
+    if (c + 1 < width && (over_all_ || !across_[p])) body(p + 1);
+    if (row > 0 && (over_all_ || !along_[p - width])) body(p - width);
+    if (row + 1 < image_.height && (over_all_ || !along_[p])) body(p + width);
   }
   void offer_beside(int64_t p, int now = 0) {
     beside(p, [&](int64_t q) {
@@ -379,8 +403,54 @@ class Flood {
   int64_t* label_;
   std::vector<uint8_t> level_, queued_;
   std::vector<int64_t> waiting_[kLevels + 1], reached_, taken_;
-  bool over_jumps_ = false;
+  bool over_all_ = false;
 };
+
+// Cut regions in which lines that are steep part two and more parts as large as seeds; the parts take what else there
+// is of their region. Regions are numbered by their first pixels.
+void cut_where_steep(const Image& image, const uint8_t* steep, int64_t* label, std::atomic<uint32_t>* parents,
+                     double* area, uint8_t* across, uint8_t* along, Poll& poll) {
+  const int64_t width = image.width, size = image.size();
+  const double pixels = image.camera.fx * image.camera.fy;
+  cells::UnionFind parts(parents, size);
+  int64_t count = 0;
+  for (int64_t p = 0; p < size; ++p) {
+    across[p] = p % width + 1 < width && label[p] != label[p + 1];
+    along[p] = p + width < size && label[p] != label[p + width];
+    count = std::max(count, label[p] + 1);
+  }
+  const auto flat = [&](int64_t p) { return label[p] >= 0 && !steep[p]; };
+  for (int64_t p = 0; p < size; ++p) {
+    if (!flat(p)) continue;
+    if (p % width > 0 && !across[p - 1] && flat(p - 1))
+      parts.join(static_cast<uint32_t>(p), static_cast<uint32_t>(p - 1));
+    if (p >= width && !along[p - width] && flat(p - width))
+      parts.join(static_cast<uint32_t>(p), static_cast<uint32_t>(p - width));
+  }
+  std::fill_n(area, size, 0.0);
+  for (int64_t p = 0; p < size; ++p)
+    if (flat(p))
+      area[parts.find(static_cast<uint32_t>(p))] += 1 / std::max(image.inverse[p] * image.inverse[p], 1e-12) / pixels;
+  const auto is_large = [&](int64_t root) { return area[root] >= image.limits->seed_area; };
+  std::vector<int64_t> large(static_cast<size_t>(count), 0), whole(static_cast<size_t>(count), -1);
+  for (int64_t p = 0; p < size; ++p)
+    if (flat(p) && parts.find(static_cast<uint32_t>(p)) == p && is_large(p)) ++large[static_cast<size_t>(label[p])];
+  std::vector<int64_t> number(static_cast<size_t>(size), -1);  // of parts, by their roots: their first pixels
+  int64_t next = 0;
+  for (int64_t p = 0; p < size; ++p) {
+    if (label[p] < 0) continue;
+    const auto own = static_cast<size_t>(label[p]);
+    if (large[own] < 2) {
+      if (whole[own] < 0) whole[own] = next++;
+      label[p] = whole[own];
+    } else {
+      const int64_t root = flat(p) ? int64_t{parts.find(static_cast<uint32_t>(p))} : -1;
+      if (root == p && is_large(p)) number[static_cast<size_t>(p)] = next++;
+      label[p] = root >= 0 ? number[static_cast<size_t>(root)] : -1;
+    }
+  }
+  Flood(image, nullptr, across, along, label).run(poll, false);
+}
 
 }  // namespace
 }  // namespace pc::touching
@@ -403,7 +473,8 @@ PC_EXPORT int32_t pc_smooth_regions(const pc_context* context, const double* inv
     double *sharpest = scratch.take<double>(size), *crease = scratch.take<double>(size);
     double* sums = scratch.take<double>(2 * size);
     uint8_t *across = scratch.take<uint8_t>(size), *along = scratch.take<uint8_t>(size);
-    uint8_t* smooth = scratch.take<uint8_t>(size);
+    uint8_t* marks = scratch.take<uint8_t>(size);
+    auto* parents = scratch.take<std::atomic<uint32_t>>(size);
     Poll poll(*context);
     window_normals(*context, image, normals);
     creases(*context, image, normals, sharpest);
@@ -412,8 +483,10 @@ PC_EXPORT int32_t pc_smooth_regions(const pc_context* context, const double* inv
     jumps(image, 1, image.limits->jump * noise, across);
     jumps(image, width, image.limits->jump * noise, along);
     Flood flood(image, crease, across, along, label);
-    flood.seeds(crease, smooth, scratch.take<std::atomic<uint32_t>>(size), sums);
-    flood.run(poll);
+    flood.seeds(crease, marks, parents, sums);
+    for (const bool over_jumps : {false, true}) flood.run(poll, over_jumps);
+    mark_steep(*context, image, marks);
+    cut_where_steep(image, marks, label, parents, sums, across, along, poll);
   });
 }
 
