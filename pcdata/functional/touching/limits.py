@@ -34,7 +34,7 @@ class Limits(NamedTuple):
     gate: float = 8.0
     # Between two normals that are compared no step may be larger.
     step: float = 6.0
-    # Tangent of the steepest surface that is followed: 72 degrees from facing the camera. Regions are cut where more is.
+    # Tangent of the steepest surface that is followed, 72 degrees from facing the camera; regions are cut beyond it.
     slope: float = 3.15
     # A full crease: 40 degrees between the normals. Convex ones count half: an object has them itself.
     full_crease: float = chord(40)
