@@ -138,6 +138,8 @@ class Limits:
     def __post_init__(self) -> None:
         for field in fields(self):
             given = getattr(self, field.name)
+            if given is None and field.default is None:
+                continue  # nobody has stated it
             numbers = given if isinstance(given, tuple) else (given,)
             if not all(isinstance(n, (int, float)) and 0 <= n < math.inf for n in numbers):
                 raise ConfigError(f"{type(self).__name__}: {field.name} must be finite and not negative, got {given}")

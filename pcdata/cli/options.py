@@ -37,10 +37,14 @@ def add_depths_of_interest(command: argparse.ArgumentParser) -> None:
     """Add what the depths are judged against."""
     depths = command.add_mutually_exclusive_group()
     depths.add_argument(
-        "--workspace", type=float, nargs=2, metavar=("NEAR", "FAR"), help="depths of interest in metres (0.2 2.0)"
+        "--workspace",
+        type=float,
+        nargs=2,
+        metavar=("NEAR", "FAR"),
+        help="depths of the task's scene in metres, such as 0.2 1.5, which most readings must lie in (default: not judged)",
     )
     depths.add_argument(
-        "--sensor", metavar="NAME", help=f"depths of interest: the range of a sensor, of {', '.join(SENSORS)}"
+        "--sensor", metavar="NAME", help=f"depths that a sensor measures, in their place: of {', '.join(SENSORS)}"
     )
 
 

@@ -9,15 +9,16 @@ from pcdata.sensors import sensor_profile
 from pcdata.structures.camera import MOST_OFF_CENTER
 from pcdata.verdicts import Limits
 
-_TABLE = (0.2, 2.0)  # metres, of a camera above a table
+_TABLE = (0.2, 2.0)  # metres: where the scene of a robot's camera usually is
 
 
 @dataclass(frozen=True, kw_only=True)
 class CaptureLimits(Limits):
-    """What a capture keeps that one may train on; the defaults suit a camera above a table."""
+    """What a capture keeps that one may train on; the defaults hold for a table as for a room."""
 
-    # Depth that the task is about, (nearest, farthest) in metres.
-    workspace: tuple[float, float] = _TABLE
+    # Depth that the task is about, (nearest, farthest) in metres; None = nobody has stated it, and no reading is held
+    # to it: only the task knows whether a wall at 3 m belongs to it.
+    workspace: tuple[float, float] | None = None
     # Metres: what one stored unit of depth of the sensor may be; none = any usual one.
     units: tuple[float, ...] = ()
     # Of a 640x480 image 200,000 readings are usual, and fewer than 100,000 are a coverage problem; as fractions they
@@ -58,13 +59,18 @@ class CaptureLimits(Limits):
 
     @property
     def workspace_is_stated(self) -> bool:
-        """Whether the workspace is that of this scene; the usual one and the range of a sensor are wider."""
-        return self.workspace != _TABLE and not self.units
+        """Whether the workspace is that of this scene; the range of a sensor is wider."""
+        return self.workspace is not None and not self.units
+
+    @property
+    def expected(self) -> tuple[float, float]:
+        """Where the scene is expected, in metres: the workspace, or where none is stated, what a robot works on."""
+        return _TABLE if self.workspace is None else self.workspace
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        near, far = self.workspace
-        if not 0 < near < far:
+        given = self.workspace
+        if given is not None and not (isinstance(given, tuple) and len(given) == 2 and 0 < given[0] < given[1]):
             raise ConfigError(
-                f"CaptureLimits: workspace must be (near, far) in metres with 0 < near < far, got {near}, {far}"
+                f"CaptureLimits: workspace must be (near, far) in metres with 0 < near < far, or None, got {given}"
             )

@@ -37,7 +37,7 @@ def validate_frame(frame: DepthFrame, *, limits: CaptureLimits | None = None) ->
 
     Args:
         frame: the capture as it was read, before any filter.
-        limits: thresholds; None = the defaults, for a camera above a table.
+        limits: thresholds; None = the defaults.
 
     Raises:
         DTypeError: it is no frame.
@@ -66,7 +66,7 @@ def validate_source(source: CaptureSource, *, limits: CaptureLimits | None = Non
 
     Args:
         source: anything with ``ids`` and ``load``; captures on disk also have their files looked at.
-        limits: thresholds; None = the defaults, for a camera above a table.
+        limits: thresholds; None = the defaults.
 
     Raises:
         DTypeError: it is no source.

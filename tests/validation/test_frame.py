@@ -13,7 +13,7 @@ from pcdata import validate_frame
 from pcdata.errors import ConfigError
 from pcdata.geometry import rigid
 from pcdata.structures import Camera, DepthFrame
-from pcdata.synthetic import Miscalibration, tabletop
+from pcdata.synthetic import Miscalibration, look_at, tabletop
 from pcdata.validation import CaptureLimits
 from pcdata.verdicts import Finding, Verdict
 from tests.validation.captures import HEIGHT, SIZE, WIDTH, scene, verdicts
@@ -35,7 +35,7 @@ def test_a_good_capture_passes_every_check(seed: int, num_views: int) -> None:
     assert all(check.name == "view_pose" and check.found.startswith("not measurable") for check in others)
     assert all(bool(check.advice) == (check in others) for check in checks)
     per_view = [check for check in checks if check.view is not None and check.name != "view_pose"]
-    assert len(per_view) == 14 * num_views
+    assert len(per_view) == 13 * num_views
 
 
 def test_every_check_has_a_number_and_a_threshold_and_goes_into_json() -> None:
@@ -68,7 +68,8 @@ def test_a_wrong_unit_fails_and_the_right_one_is_told(factor: float, cure: str) 
 def test_a_far_scene_is_no_wrong_unit_once_the_workspace_is_given() -> None:
     frame = scene(num_views=1).frame
     far = replace(frame, depth=frame.depth * 5)
-    assert {"depth_unit", "workspace_fraction"} <= failed(far)
+    assert "depth_unit" in failed(far)
+    assert {"depth_unit", "workspace_fraction"} <= failed(far, CaptureLimits(workspace=(0.2, 2.0)))
     assert not {"depth_unit", "workspace_fraction"} & failed(far, CaptureLimits(workspace=(2.5, 30.0)))
 
 
@@ -81,7 +82,7 @@ def test_a_scene_at_the_end_of_the_workspace_is_no_wrong_unit(distance: float) -
     check = next(one for one in validate_frame(spread) if one.name == "depth_unit")
     assert check.verdict is Verdict.PASS
     assert check.value == pytest.approx(distance, abs=0.01)
-    assert check.threshold == 2 * CaptureLimits().workspace[1]
+    assert check.threshold == 2 * CaptureLimits().expected[1]
 
 
 @pytest.mark.parametrize(
@@ -261,9 +262,34 @@ def test_65535_read_as_depth_fails_and_the_cure_is_told() -> None:
 
 
 def test_a_workspace_that_is_none_is_refused() -> None:
-    for near, far in ((2.0, 0.2), (0.0, 1.0), (0.5, float("inf")), (float("nan"), 1.0)):
+    for given in ((2.0, 0.2), (0.0, 1.0), (0.5, float("inf")), (float("nan"), 1.0), (0.5,), (1.0, 2.0, 3.0), 2.0):
         with pytest.raises(ConfigError, match="workspace must be"):
-            CaptureLimits(workspace=(near, far))
+            CaptureLimits(workspace=given)  # type: ignore[arg-type]
+
+
+def test_only_a_workspace_that_is_stated_is_held_to_though_it_is_the_usual_one() -> None:
+    frame = scene(num_views=1).frame
+    assert not {one.name for one in validate_frame(frame)} & {"workspace_fraction"}
+    usual = CaptureLimits().expected
+    stated = CaptureLimits(workspace=usual)
+    assert stated.workspace_is_stated
+    assert not CaptureLimits().workspace_is_stated
+    assert {one.name for one in validate_frame(frame, limits=stated)} & {"workspace_fraction"}
+    assert not CaptureLimits.for_sensor("realsense_d435").workspace_is_stated
+
+
+@pytest.mark.parametrize("away", [1.6, 2.0, 2.4])
+def test_a_room_is_no_worse_than_a_table(away: float) -> None:
+    """The floor with a table on it, from where somebody stands: most of it lies beyond 2 m; tenfold it is told."""
+    pose = look_at((away, -1.2, 1.6))[None]
+    frame = replace(
+        tabletop(3, noise="stereo", size=SIZE, world_from_camera=pose).frame, provenance={"metres_per_unit": 0.001}
+    )
+    assert float(frame.depth[frame.depth > 0].median()) > 2.2
+    unusual = {one.name for one in validate_frame(frame) if one.verdict in (Verdict.WARN, Verdict.FAIL)}
+    assert unusual <= {"missing_region", "saturation"}, "the floor ends, and beyond 6 m nothing is read"
+    tenfold = replace(frame, depth=10 * frame.depth, provenance={"metres_per_unit": 0.01})
+    assert "depth_unit" in failed(tenfold)
 
 
 def test_validation_is_public() -> None:

@@ -133,7 +133,7 @@ def gather_captures(
     Args:
         source: anything with ``ids`` and ``load``.
         pipeline: steps to be shown too; its random ones are left out. None = the cloud that each capture shows.
-        limits: of the checks; None = the defaults, for a camera above a table.
+        limits: of the checks; None = the defaults.
         num_shown: captures with pictures and clouds.
         title: of the page; "" = its name, and how many there are.
         progress: told (captures judged, all, which).

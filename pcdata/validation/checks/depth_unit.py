@@ -41,18 +41,19 @@ def depth_unit_check(
 ) -> Finding:
     """Pass a unit that alone fits the numbers, warn where others fit too and name them, fail one that does not fit.
 
-    Half of the readings beyond twice the workspace warn, whatever the unit.
+    Half of the readings beyond twice the workspace warn, whatever the unit; where none is stated, beyond twice where
+    the scene of a robot's camera usually is.
     """
     values, unit, is_known = stored_numbers(depth, facts)
     readings = depth[depth > 0]
     median = float(readings.median())
-    near, far = limits.workspace
+    near, far = limits.expected
     beyond = max(near / median, median / far)
     fits = unit_fits(
         values,
         declared=unit,
         focal=focal,
-        workspace=limits.workspace,
+        workspace=limits.expected,
         workspace_is_known=limits.workspace_is_stated,
         known_units=[unit.metres] if facts.get("unit_is_recorded") and is_known else limits.units,
     )
@@ -60,7 +61,8 @@ def depth_unit_check(
     probability = sum(fit.probability for fit in fits if abs(fit.median / own_median - 1) < _SAME)
     others = [fit for fit in fits if fit.probability >= _NAMED and abs(fit.median / own_median - 1) >= _SAME]
     own = [UnitFit(unit, probability, median)] if probability >= _REFUTED else []
-    found = f"half of the readings lie within {median:.3g} m; the workspace is {near:g} to {far:g} m"
+    told = "usual" if limits.workspace is None else "the workspace"
+    found = f"half of the readings lie within {median:.3g} m; {told} is {near:g} to {far:g} m"
     if probability < _REFUTED and others:
         verdict = Verdict.FAIL
         advice = f"{_mend(others, unit, is_known)}{_doubt(others)}"

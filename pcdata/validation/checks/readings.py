@@ -27,7 +27,8 @@ CAMERA = "camera"  # frames of clouds whose z is depth begin so
     findings={
         "depth_unit": (
             "median depth",
-            "one unit alone fits the numbers (probability 0.94) and the median is up to twice beyond the workspace",
+            "one unit alone fits the numbers (probability 0.94) and the median is up to twice beyond the workspace, or, where "
+            "none is stated, beyond the usual {0.expected[0]:g} to {0.expected[1]:g} m",
             "the declared unit has a probability below 0.02",
             "every usual unit (1/1000, 1/4000, 1/5000, 1/10000, 1/256 m, metres, rotated bits, swapped bytes, ...) is "
             "tried on the numbers as stored: how usual it is, distance, noise and disparity steps for the focal "
@@ -39,7 +40,8 @@ CAMERA = "camera"  # frames of clouds whose z is depth begin so
             "readings inside the workspace / all readings",
             "{0.workspace_fraction[0]:.0%}",
             "below {0.workspace_fraction[1]:.1%}",
-            "most of what is seen should be what the task is about",
+            "most of what is seen should be what the task is about. Judged only where that is stated, with `--workspace` "
+            "or `--sensor`: a room is no worse than a table",
         ),
         "saturation": (
             "readings exactly at the highest or lowest depth, where they outnumber those within 2 % of it",
@@ -88,22 +90,17 @@ def _judged(
         return []  # coverage has said so
     return [
         depth_unit_check(depth if depth.ndim == 2 else depth[None], limits, facts or {}, focal=focal, view=view),
-        _range(readings, limits, view),
+        *([] if limits.workspace is None else [_range(readings, limits, limits.workspace, view)]),
         _saturation(readings, limits, (facts or {}).get("metres_per_unit"), view),
     ]
 
 
-def _share_inside(readings: Tensor, limits: CaptureLimits) -> float:
-    near, far = limits.workspace
-    return float(((readings >= near) & (readings <= far)).float().mean())
-
-
-def _range(readings: Tensor, limits: CaptureLimits, view: int | None) -> Finding:
-    near, far = limits.workspace
+def _range(readings: Tensor, limits: CaptureLimits, workspace: tuple[float, float], view: int | None) -> Finding:
+    near, far = workspace
     one_percent = len(readings) // 100
     low = float(readings.kthvalue(1 + one_percent).values)
     high = float(readings.kthvalue(len(readings) - one_percent).values)
-    fraction = _share_inside(readings, limits)
+    fraction = float(((readings >= near) & (readings <= far)).float().mean())
     return graded(
         "workspace_fraction",
         fraction,
