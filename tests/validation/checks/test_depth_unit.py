@@ -102,7 +102,8 @@ def test_the_true_unit_is_named_and_no_advice_passes_at_a_wrong_scale(
 @pytest.mark.parametrize("seed", [31, 32])
 @pytest.mark.parametrize("unit", [DepthUnit(0.001), DepthUnit(1.0)], ids=str)
 def test_millimetres_and_metres_that_are_right_pass(tmp_path: Path, unit: DepthUnit, seed: int) -> None:
-    scenes = [(table(seed), None), (table(seed, None), None), (room(seed % 5), CaptureLimits(workspace=(0.3, 6.0))), (room(seed % 5), None)]
+    stated = CaptureLimits(workspace=(0.3, 6.0))
+    scenes = [(table(seed), None), (table(seed, None), None), (room(seed % 5), stated), (room(seed % 5), None)]
     for number, (scene, limits) in enumerate(scenes):
         verdict, text, _ = judged(capture(tmp_path / str(number), scene, unit), unit, limits)
         assert verdict is Verdict.PASS, text
