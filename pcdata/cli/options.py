@@ -41,7 +41,8 @@ def add_depths_of_interest(command: argparse.ArgumentParser) -> None:
         type=float,
         nargs=2,
         metavar=("NEAR", "FAR"),
-        help="depths of the task's scene in metres, such as 0.2 1.5, which most readings must lie in (default: not judged)",
+        help="depths of the task's scene in metres, such as 0.2 1.5, which most readings must lie in "
+        "(default: not judged)",
     )
     depths.add_argument(
         "--sensor", metavar="NAME", help=f"depths that a sensor measures, in their place: of {', '.join(SENSORS)}"

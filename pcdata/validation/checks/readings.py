@@ -27,8 +27,8 @@ CAMERA = "camera"  # frames of clouds whose z is depth begin so
     findings={
         "depth_unit": (
             "median depth",
-            "one unit alone fits the numbers (probability 0.94) and the median is up to twice beyond the workspace, or, where "
-            "none is stated, beyond the usual {0.expected[0]:g} to {0.expected[1]:g} m",
+            "one unit alone fits the numbers (probability 0.94) and the median is up to twice beyond the workspace, "
+            "or, where none is stated, beyond the usual {0.expected[0]:g} to {0.expected[1]:g} m",
             "the declared unit has a probability below 0.02",
             "every usual unit (1/1000, 1/4000, 1/5000, 1/10000, 1/256 m, metres, rotated bits, swapped bytes, ...) is "
             "tried on the numbers as stored: how usual it is, distance, noise and disparity steps for the focal "
@@ -40,8 +40,8 @@ CAMERA = "camera"  # frames of clouds whose z is depth begin so
             "readings inside the workspace / all readings",
             "{0.workspace_fraction[0]:.0%}",
             "below {0.workspace_fraction[1]:.1%}",
-            "most of what is seen should be what the task is about. Judged only where that is stated, with `--workspace` "
-            "or `--sensor`: a room is no worse than a table",
+            "most of what is seen should be what the task is about. Judged only where that is stated, with "
+            "`--workspace` or `--sensor`: a room is no worse than a table",
         ),
         "saturation": (
             "readings exactly at the highest or lowest depth, where they outnumber those within 2 % of it",
