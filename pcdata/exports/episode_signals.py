@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -11,19 +12,27 @@ from torch import Tensor
 
 from pcdata.errors import CaptureError, near_matches
 from pcdata.structures import DepthFrame, PointCloud
-from pcdata.structures.signal_kinds import poses_in_a_row
+from pcdata.structures.pose_rows import continued, poses_in_a_row
 from pcdata.structures.signals import Signal, cloud_from_frame, is_frame_of_camera
 
 _STILL = 1e-6  # metres and parts of a rotation by which the poses of a camera that stands still may differ
 
 
 def signal_row(
-    where: str, cloud: PointCloud | DepthFrame, what: str, names: str, *, poses: str = "", free: bool = False
+    where: str,
+    cloud: PointCloud | DepthFrame,
+    what: str,
+    names: str,
+    *,
+    poses: str = "",
+    free: bool = False,
+    before: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """Return signals of one cloud or capture side by side, as float32 (D,); with ``free`` one signal of any shape.
 
     Poses are written in the layout ``poses``; "" = as they were recorded, matrices as :data:`USUAL_ROW`. With ``free``
-    the signal stays as it is.
+    the signal stays as it is. With the row of the step ``before`` quaternions have the sign nearest to it, but for
+    those that are written as they were recorded and in the frame that they were recorded in.
 
     Raises:
         CaptureError: there is no such signal, or one that is no row of numbers.
@@ -37,16 +46,24 @@ def signal_row(
                 f"signals are: {known}; attach it to the captures (with_signal), or say {what}=NAME,NAME"
             )
         values: Any = signals[name]
-        if not free:
-            values = _in_a_row(cloud.recorded_signals[name].kind, values, poses)
+        recorded = cloud.recorded_signals[name]
+        values = _written(recorded, values, poses, free=free, before=_further(before, parts))
         parts.append(_numbers(where, what, name, values, free=free))
     return np.concatenate(parts)
 
 
 def next_row(
-    where: str, cloud: PointCloud, following: PointCloud, names: str, *, poses: str = ""
+    where: str,
+    cloud: PointCloud,
+    following: PointCloud,
+    names: str,
+    *,
+    poses: str = "",
+    before: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
     """Return the signals of the following cloud in the coordinates of this one, side by side, as :func:`signal_row`.
+
+    ``before`` is the state of this cloud.
 
     Raises:
         CaptureError: this cloud does not know the frame that one was recorded in.
@@ -67,12 +84,25 @@ def next_row(
                     "a frame that stands still"
                 )
             values = signal.moved(cloud_from_frame(cloud, signal.frame))
-        parts.append(_numbers(where, "state", name, _in_a_row(signal.kind, values, poses), free=False))
+        values = _written(signal, values, poses, free=False, before=_further(before, parts))
+        parts.append(_numbers(where, "state", name, values, free=False))
     return np.concatenate(parts)
 
 
-def _in_a_row(kind: str, values: Any, poses: str) -> Any:
-    return poses_in_a_row(kind, values, poses)[1] if isinstance(values, Tensor) else values
+def _further(before: NDArray[np.float32] | None, parts: Sequence[NDArray[np.float32]]) -> NDArray[np.float32] | None:
+    """Return what of the row before stands after some parts of this one, which have the same widths."""
+    return None if before is None else before[sum(map(len, parts)) :]
+
+
+def _written(recorded: Signal, values: Any, poses: str, *, free: bool, before: NDArray[np.float32] | None) -> Any:
+    """Return values as the row holds them; quaternions that are computed go on from those before."""
+    if not isinstance(values, Tensor) or not isinstance(recorded.values, Tensor):
+        return values
+    kind, row = (recorded.kind, values) if free else poses_in_a_row(recorded.kind, values, poses)
+    is_recorded = not poses and kind == recorded.kind and torch.equal(values, recorded.values)
+    if is_recorded or before is None or before.size < row.numel():  # of a row that is narrower the caller tells
+        return row
+    return continued(kind, row, torch.from_numpy(before.reshape(-1)[: row.numel()]).reshape(row.shape))
 
 
 def _stays(cloud: PointCloud, following: PointCloud) -> bool:

@@ -32,7 +32,7 @@ from pcdata.files.sample_names import counted
 from pcdata.io.store.sample_keys import key_of
 from pcdata.models import contract
 from pcdata.structures import DepthFrame, Episode, PointCloud
-from pcdata.structures.signal_kinds import checked_pose_layout
+from pcdata.structures.pose_rows import checked_pose_layout
 
 _CHUNK = 100  # timesteps, as the original converters have it
 # The loaders ask for img, of any size, read all of it into memory and use none of it: one pixel per timestep will do.
@@ -198,18 +198,21 @@ class _ReplayBuffer(Target):
         check_same_count(where, cloud, seen.get("count", cloud.num_points))
         rows: Rows = {"point_cloud": points}
         if self.episodes is None:
-            state = signal_row(where, cloud, "state", self.state, poses=self.poses)
+            before: Rows = seen.get("before", {})
+            state = signal_row(where, cloud, "state", self.state, poses=self.poses, before=before.get("state"))
             rows.update(dict.fromkeys(self.state_arrays, state))
             if not self.next_state:
-                rows["action"] = signal_row(where, cloud, "action", self.action, poses=self.poses)
+                former = before.get("action")
+                rows["action"] = signal_row(where, cloud, "action", self.action, poses=self.poses, before=former)
             for name in self.further:
-                rows[name] = signal_row(where, cloud, name, name, free=True)
+                rows[name] = signal_row(where, cloud, name, name, free=True, before=before.get(name))
             for name, row in rows.items():
                 if row.shape != seen.setdefault(f"shape of {name}", row.shape):
                     wanted = seen[f"shape of {name}"]
                     raise ContractError(
                         f"{where}: {name} is {row.shape}, that of the samples before {wanted}; one robot, one width"
                     )
+            seen["before"] = {"state": state, **rows}
         seen["frame"], seen["count"] = frame, cloud.num_points
         return cloud, rows
 
@@ -246,9 +249,12 @@ class _ReplayBuffer(Target):
     def _steps(self, item: Item, samples: Samples) -> Iterator[tuple[str, Rows]]:
         """Yield the timesteps, whole; where actions are next states, one later than they come."""
         seen: dict[str, Any] = {}
+        first = {one.first for one in item.episodes}
         last = {one.first + one.length - 1 for one in item.episodes}
         before: tuple[str, PointCloud, Rows] | None = None
         for number, (sample_id, data) in enumerate(samples):
+            if number in first:
+                seen.pop("before", None)  # no trajectory goes on from another episode
             cloud, rows = self.examine(item, sample_id, data, seen)
             if not self.next_state:
                 yield sample_id, rows
@@ -256,7 +262,8 @@ class _ReplayBuffer(Target):
             if before is not None:
                 name, former, former_rows = before
                 where = f"{self.name}: sample {name!r}"
-                former_rows["action"] = next_row(where, former, cloud, self.state, poses=self.poses)
+                state = former_rows[self.state_arrays[0]]
+                former_rows["action"] = next_row(where, former, cloud, self.state, poses=self.poses, before=state)
                 yield name, former_rows
             before = None if number in last else (sample_id, cloud, rows)
 

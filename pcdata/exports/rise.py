@@ -134,7 +134,8 @@ class _Rise(Target):
             depth_units(where, frame.depth[0], metres_per_unit=unit, round_to_unit=self.round_depth)
         except CaptureError as error:
             raise CaptureError(f"{error}; the loader reads units of {unit:g} m: say round_depth=true") from error
-        tcp, camera_from_base = self._tcp(where, frame)
+        tcp, camera_from_base = self._tcp(where, frame, seen.get("tcp"))
+        seen["tcp"] = tcp
         width = signal_row(where, frame, "gripper", self.gripper)
         if width.shape != (1,) or not 0 <= float(width[0]) < 1:
             raise CaptureError(f"{where}: gripper must be one width in metres, 0 to 1, got {width.tolist()!r:.100}")
@@ -149,7 +150,9 @@ class _Rise(Target):
             )
         return _Step(frame, tcp, width.astype(np.float64) / _OPEN * 1000)
 
-    def _tcp(self, where: str, frame: DepthFrame) -> tuple[NDArray[np.float64], Tensor]:
+    def _tcp(
+        self, where: str, frame: DepthFrame, before: NDArray[np.float64] | None
+    ) -> tuple[NDArray[np.float64], Tensor]:
         signals = frame.recorded_signals
         if self.tcp not in signals:
             raise CaptureError(
@@ -163,14 +166,16 @@ class _Rise(Target):
                 f"{where}: tcp must be a 'pose LAYOUT' of one step, but the signal {self.tcp!r} is {signal!r}"
             )
         values = signal.values[0].double()
-        position, quaternion = _position_and_quaternion(layout, values)
+        position, quaternion, is_recorded = _position_and_quaternion(layout, values)
         if position is None:
             raise CaptureError(
                 f"{where}: tcp must be a pose, but the signal {self.tcp!r} is a rotation alone: {signal!r}"
             )
-        pose = torch.cat([position, quaternion]).numpy()
-        if pose.shape != (7,):
+        if position.shape != (3,):
             raise CaptureError(f"{where}: tcp must be one pose, but the signal {self.tcp!r} is {signal!r}")
+        if before is not None and not is_recorded:
+            quaternion = rotations.nearest_sign(quaternion, torch.from_numpy(before[3:]))
+        pose = torch.cat([position, quaternion]).numpy()
         if signal.frame == CAMERA_FRAME:
             return pose, torch.eye(4, dtype=torch.float64, device="cpu")
         assert frame.world_from_camera is not None  # a capture knows the frames of its signals
@@ -245,15 +250,15 @@ def _units_per_metre(camera: str) -> int:
     return 4000 if "f" in camera else 1000
 
 
-def _position_and_quaternion(name: str, values: Tensor) -> tuple[Tensor | None, Tensor]:
-    """Return x y z and the quaternion w x y z of one pose; a quaternion stays as it was recorded."""
+def _position_and_quaternion(name: str, values: Tensor) -> tuple[Tensor | None, Tensor, bool]:
+    """Return x y z and the quaternion w x y z of one pose, and whether it stays as it was recorded."""
     layout = LAYOUTS[name]
     position, part = layout.parts(values)
     if name.endswith("quat_wxyz"):
-        return position, part
+        return position, part, True
     if name.endswith("quat_xyzw"):
-        return position, part.roll(1, -1)
-    return position, rotations.quaternion_from_rotation(layout.rotation(part))
+        return position, part.roll(1, -1), True
+    return position, rotations.quaternion_from_rotation(layout.rotation(part)), False
 
 
 def _stamps(episode: Episode) -> list[int]:

@@ -180,6 +180,11 @@ def mean_rotation(rotation: Tensor, weights: Tensor | None = None) -> Tensor:
     return rotation_from_unit_quaternion(_nonnegative(torch.linalg.eigh(spread).eigenvectors[..., -1]))
 
 
+def nearest_sign(quaternion: Tensor, before: Tensor) -> Tensor:
+    """Return (..., 4) quaternions of the same rotations in the sign that is nearest to others; a tie keeps its sign."""
+    return torch.where((quaternion * before).sum(-1, keepdim=True) < 0, -quaternion, quaternion)
+
+
 def _nonnegative(quaternion: Tensor) -> Tensor:
     """Return the one of q and -q whose first component that is not 0 is positive."""
     sign = quaternion.sign()

@@ -106,6 +106,7 @@ class PoseLayout:
     conjugated: Callable[[Tensor, Tensor, Tensor], Tensor]  # rotation part, Q, handedness (..., 1) -> Q R Q^T
     faults: Callable[[Tensor], list[Fault]]  # of rotation parts; of poses that are 4x4, of those
     has_position: bool = True
+    is_quaternion: bool = False  # so its rotation part and the opposite one are the same rotation
 
     @property
     def is_matrix(self) -> bool:
@@ -134,7 +135,7 @@ class PoseLayout:
         return self.faults(values if self.is_matrix else self.parts(values)[1])
 
 
-Ways = dict[str, Callable[..., Tensor | list[Fault]]]
+Ways = dict[str, Callable[..., Tensor | list[Fault]] | bool]
 
 
 def _by_matrix(rotation: Callable[[Tensor], Tensor], written: Callable[[Tensor], Tensor]) -> Ways:
@@ -179,7 +180,8 @@ def _quaternion(w_last: bool) -> Ways:
         quaternion = rotations.quaternion_from_rotation(rotation)
         return quaternion.roll(-1, -1) if w_last else quaternion
 
-    return {"rotation": rotation_of, "written": written, "turned": turned, "conjugated": conjugated, "faults": faults}
+    ways: Ways = {"rotation": rotation_of, "written": written, "turned": turned, "conjugated": conjugated}
+    return {**ways, "faults": faults, "is_quaternion": True}
 
 
 def _two_vectors(rows: bool) -> Ways:

@@ -18,8 +18,6 @@ from pcdata.errors import ConfigError, DTypeError, near_matches
 from pcdata.geometry import rigid
 from pcdata.structures.pose_layouts import LAYOUTS, Fault, Motion, PoseLayout, applied, per_cloud
 
-USUAL_ROW = "xyz_rot6d_rows"  # the numbers of R never jump, as those of a quaternion or of angles may
-
 
 def _moved_position(values: Tensor, motion: Motion, layout: PoseLayout | None) -> Tensor:
     linear, offset = (per_cloud(part, values, 1) for part in (motion.linear, motion.offset))
@@ -130,7 +128,7 @@ def moved_values(values: Tensor, parts: Sequence[_Part], motion: Motion) -> Tens
         return values
     moved = [
         own if part.row.move is None else part.row.move(own, motion, part.layout)
-        for part, own in zip(parts, _columns(values.double(), parts))
+        for part, own in zip(parts, columns_of(values.double(), parts))
     ]
     rests = motion.rests.reshape(-1, *[1] * (values.ndim - 1))
     return torch.where(rests, values, torch.cat(moved, dim=-1).to(values.dtype))
@@ -138,12 +136,13 @@ def moved_values(values: Tensor, parts: Sequence[_Part], motion: Motion) -> Tens
 
 def pose_faults(values: Tensor, parts: Sequence[_Part]) -> Iterator[Fault]:
     """Yield what can be wrong with the poses among (B, ..., row) values, and where it is."""
-    for part, own in zip(parts, _columns(values, parts)):
+    for part, own in zip(parts, columns_of(values, parts)):
         if part.layout is not None:
             yield from part.layout.faults_of(own.double())
 
 
-def _columns(values: Tensor, parts: Sequence[_Part]) -> Sequence[Tensor]:
+def columns_of(values: Tensor, parts: Sequence[_Part]) -> Sequence[Tensor]:
+    """Return the columns of each part of (B, ..., row) values."""
     return [values] if len(parts) == 1 else values.split([part.columns or 0 for part in parts], dim=-1)
 
 
@@ -156,51 +155,6 @@ def poses_of_signal(kind: str, values: Tensor) -> Tensor | None:  # (B, ..., 4, 
     position, rotation = layout.parts(values.double())
     assert position is not None  # has_position
     return rigid.from_rotation_translation(layout.rotation(rotation), position)
-
-
-def checked_pose_layout(where: str, layout: str) -> str:
-    """Require a layout that writes a whole pose in one row.
-
-    Raises:
-        ConfigError: there is none of this name; says which are.
-    """
-    known = [name for name, one in LAYOUTS.items() if one.has_position and not one.is_matrix]
-    if layout not in known:
-        raise ConfigError(
-            f"{where}: a pose is written in a row as one of {', '.join(known)}, not {layout!r:.100}"
-            f"{near_matches(str(layout), known)}"
-        )
-    return layout
-
-
-def poses_rewritten(kind: str, values: Tensor, layout: str) -> tuple[str, Tensor]:
-    """Return a kind and values (B, ...) with every pose written in another layout of a row, in the same dtype.
-
-    A rotation alone becomes the rotation part of the layout. What is no pose, or is in this layout, keeps its bits.
-    """
-    parsed = parse_kind(kind)
-    words, columns = [], []
-    for part, own, word in zip(parsed.parts, _columns(values, parsed.parts), parsed.text.split(" + ")):
-        if part.layout is not None:
-            name = layout if part.layout.has_position else layout.removeprefix("xyz_")
-            if LAYOUTS[name] is not part.layout:
-                position, rotation = part.layout.parts(own.double())
-                written = LAYOUTS[name].written(part.layout.rotation(rotation))
-                own = (written if position is None else torch.cat([position, written], dim=-1)).to(values.dtype)
-            word = f"{part.name} {name}"
-        words.append(word)
-        columns.append(own)
-    return " + ".join(words), columns[0] if len(columns) == 1 else torch.cat(columns, dim=-1)
-
-
-def poses_in_a_row(kind: str, values: Tensor, layout: str = "") -> tuple[str, Tensor]:
-    """Return a kind and values with its poses as a row of numbers holds them.
-
-    Written in ``layout``; "" = as they are, but matrices as :data:`USUAL_ROW`.
-    """
-    parts = parse_kind(kind).parts
-    is_matrix = any(part.layout is not None and part.layout.is_matrix for part in parts)
-    return poses_rewritten(kind, values, layout or USUAL_ROW) if layout or is_matrix else (kind, values)
 
 
 # -- the words -----------------------------------------------------------------------------------------------------

@@ -16,13 +16,8 @@ from torch import Tensor
 from pcdata.errors import DeviceError, DTypeError, FrameError, NonFiniteError, PoseError, ShapeError
 from pcdata.structures.kinds import CAMERA_FRAME
 from pcdata.structures.pose_layouts import motion_by
-from pcdata.structures.signal_kinds import (
-    checked_pose_layout,
-    moved_values,
-    parse_kind,
-    pose_faults,
-    poses_rewritten,
-)
+from pcdata.structures.pose_rows import checked_pose_layout, continued_along, poses_rewritten
+from pcdata.structures.signal_kinds import moved_values, parse_kind, pose_faults
 from pcdata.structures.structure import Structure, derived
 
 if TYPE_CHECKING:
@@ -108,19 +103,28 @@ class Signal(Structure):
         _check_motion("Signal.moved", matrix, len(self))
         return _moved(f"Signal.moved: a {self.kind!r}", self, motion_by(matrix.to(device=self.values.device)))
 
-    def with_poses_as(self, layout: str) -> Signal:
+    def with_poses_as(self, layout: str, *, along: int | None = None) -> Signal:
         """Return the same poses written in another layout of a row, such as ``"xyz_rot6d_rows"``; the dtype stays.
 
         A rotation alone becomes the rotation part of the layout. What is no pose, and a pose in this layout already,
-        keeps its bits. A quaternion comes out with w >= 0, so it may jump between steps; six numbers of R never do.
+        keeps its bits. A quaternion comes out with w >= 0.
+
+        Args:
+            layout: how a pose is written, see docs/signals.md.
+            along: the axis of the values along which poses follow each other in time, 0 of a whole episode, 1 of a
+                horizon: then every quaternion has the sign nearest to the one before, so that it does not jump where
+                w passes 0. None = they are poses of their own.
 
         Raises:
             ConfigError: there is no such layout of a row.
+            ShapeError: the values have no such axis.
         """
         checked_pose_layout("Signal.with_poses_as", layout)
         if isinstance(self.values, tuple):
             return self
         kind, values = poses_rewritten(self.kind, self.values, layout)
+        if along is not None:
+            values = continued_along(kind, values, along)
         return replace(self, kind=kind, values=values)
 
     def same_bits(self, other: Signal) -> bool:

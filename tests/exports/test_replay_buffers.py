@@ -321,6 +321,61 @@ def test_poses_that_are_4x4_become_position_and_rotation(poses: str, rotation: A
     np.testing.assert_allclose(data["action"][:6], wanted[1:], atol=1e-6)
 
 
+def check_continued(quaternions: np.ndarray, numbers: range) -> None:
+    """x y z w of posed_step by its numbers: the same rotations, and each nearest to the one before."""
+    half = 0.2 * np.array(numbers)
+    wanted = np.stack([0 * half, 0 * half, np.sin(half), np.cos(half)], axis=1)
+    sign = np.sign((quaternions * wanted).sum(1, keepdims=True))
+    np.testing.assert_allclose(sign * quaternions, wanted, atol=1e-6)
+    assert np.linalg.norm(np.diff(quaternions, axis=0), axis=1).max() < 0.21  # half the angle of a step
+
+
+def test_quaternions_begin_with_w_above_0_and_do_not_jump_within_an_episode(tmp_path: Path) -> None:
+    """Half a turn lies after the eighth step of the first and after the tenth of the second: there w passes 0."""
+    out = tmp_path / "dp3.zarr"
+    source = Recording((12, 14), posed_step)
+    export_dataset(source, "dp3", out, state="width,eef", action="eef", poses="xyz_quat_xyzw")
+    data, _ = read(out, ["state", "action"])
+    for rows in (data["state"][:, 4:], data["action"][:, 3:]):
+        for steps in (range(12), range(12, 26)):
+            check_continued(rows[steps.start : steps.stop], steps)
+            assert rows[steps.start, 3] >= 0
+
+
+def test_an_action_that_is_the_next_state_has_its_sign(tmp_path: Path) -> None:
+    out = tmp_path / "dp3.zarr"
+    export_dataset(Recording((12,), posed_step), "dp3", out, state="eef", next_state=True, poses="xyz_quat_xyzw")
+    data, _ = read(out, ["state", "action"])
+    check_continued(data["state"][:, 3:], range(11))
+    assert np.array_equal(data["action"][:-1], data["state"][1:])
+    check_continued(data["action"][-2:, 3:], range(10, 12))
+
+
+def test_recorded_quaternions_keep_their_bits_unless_they_move_or_a_layout_is_asked_for(tmp_path: Path) -> None:
+    def recorded(number: int) -> PointCloud:
+        pose = posed_step(number).recorded_signals["eef"].with_poses_as("xyz_quat_xyzw").values.float()
+        pose = pose * torch.tensor([1, 1, 1, *[-1 if number % 2 else 1] * 4])  # as no recorder should
+        return cloud(512, seed=number).with_signal("eef", pose, "pose xyz_quat_xyzw", "base")
+
+    def moved(number: int) -> PointCloud:
+        turn = torch.eye(4, dtype=torch.float64)[None]
+        angle = torch.tensor(-0.4 * number)
+        turn[0, :2, :2] = torch.stack([angle.cos(), -angle.sin(), angle.sin(), angle.cos()]).reshape(2, 2)
+        return recorded(number).transformed(turn)
+
+    for name, make, poses in (("kept", recorded, ""), ("written", recorded, "xyz_quat_xyzw"), ("moved", moved, "")):
+        source = Recording((12,), make)
+        export_dataset(source, "dp3", tmp_path / name, state="eef", action="eef", poses=poses)
+        data, _ = read(tmp_path / name, ["state"])
+        if name == "kept":
+            values = torch.cat([one.recorded_signals["eef"].values for one in source.samples.values()])
+            assert np.array_equal(data["state"], values.numpy())
+        elif name == "written":
+            check_continued(data["state"][:, 3:], range(12))
+        else:
+            np.testing.assert_allclose(data["state"][:, 3:], [[0, 0, 0, 1]] * 12, atol=1e-6)  # moved onto each other
+
+
 def test_a_wrong_layout_of_poses_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="dp3: poses: a pose is written in a row as one of"):
         export_dataset(Recording((12,), posed_step), "dp3", tmp_path / "a", state="eef", action="eef", poses="rot6d")

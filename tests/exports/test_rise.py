@@ -125,6 +125,23 @@ def test_every_layout_of_a_pose_becomes_the_same_pose(tmp_path, kind):
     assert np.allclose(camera_from_base(next((tmp_path / "out/calib").iterdir())), np.eye(4), atol=1e-12)
 
 
+def test_matrices_of_an_episode_become_quaternions_that_do_not_jump(tmp_path):
+    def made(number):
+        whole = np.eye(4)
+        whole[:3, :3] = Rotation.from_rotvec([0, 0.3 * number + 2, 0]).as_matrix()  # half a turn before the fourth
+        return step(number).without_signal("tcp").with_signal("tcp", torch.tensor(whole)[None], "pose matrix", "table")
+
+    export_dataset(Recording((8,), made), "rise", tmp_path / "out")
+    files = sorted((tmp_path / "out").glob("train/e0/cam_*/tcp/*.npy"))
+    turns = np.stack([np.load(file)[3:] for file in files])
+    assert turns[0, 0] > 0 > turns[-1, 0]
+    assert np.linalg.norm(np.diff(turns, axis=0), axis=1).max() < 0.16  # half the angle of a step
+    several = torch.tensor([[[0.0, 0, 0, 0, 0, 0, 1]] * 2], dtype=torch.float64)
+    two = step(0).without_signal("tcp").with_signal("tcp", several, "pose xyz_quat_xyzw", "table")
+    with pytest.raises(CaptureError, match="tcp must be one pose"):
+        export_dataset(Recording((1,), lambda _: two), "rise", tmp_path / "two")
+
+
 def test_episodes_that_do_not_fit_are_refused_or_left_out(tmp_path):
     def refused(error, message, made, **options):
         source = Recording((2, 2), lambda number: made(number) if number == 1 else step(number))

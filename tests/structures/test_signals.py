@@ -544,6 +544,59 @@ def test_poses_written_in_another_layout_are_the_same_poses(name, other):
     assert found.with_poses_as(other).same_bits(found)
 
 
+def turning(count):  # (count, 4, 4), a whole turn and a half about an axis: w passes 0 three times
+    matrix = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    vectors = torch.linspace(0, 3 * torch.pi, count, dtype=torch.float64)[:, None] * torch.tensor([0.6, 0.0, 0.8])
+    matrix[:, :3, :3] = torch.from_numpy(Rotation.from_rotvec(vectors.numpy()).as_matrix())
+    matrix[:, :3, 3] = torch.rand(count, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return matrix
+
+
+def largest_step(rows):
+    return float((rows[1:] - rows[:-1])[..., 3:7].norm(dim=-1).max())
+
+
+@pytest.mark.parametrize("layout", ["xyz_quat_xyzw", "xyz_quat_wxyz"])
+def test_quaternions_of_a_trajectory_do_not_jump_and_those_of_single_poses_have_w_above_0(layout):
+    matrix = turning(101)
+    w = 6 if layout.endswith("xyzw") else 3
+    one_by_one = Signal(matrix, "pose matrix", "base").with_poses_as(layout).values
+    assert bool((one_by_one[:, w] >= 0).all())
+    assert largest_step(one_by_one) > 1.9
+    episode = Signal(matrix, "pose matrix", "base").with_poses_as(layout, along=0)
+    assert largest_step(episode.values) < 0.05  # half the angle of a step
+    torch.testing.assert_close(poses_of_signal(episode.kind, episode.values), matrix, rtol=0, atol=1e-12)
+    assert torch.equal(episode.values[0], one_by_one[0])
+    # Of a horizon every cloud has a trajectory of its own; what jumped before goes on, what did not keeps its bits.
+    horizons = torch.stack([matrix, matrix.flip(0)])
+    written = Signal(horizons, "pose matrix", "base").with_poses_as(layout, along=1).values
+    assert torch.equal(written[0], episode.values)
+    assert largest_step(written[1]) < 0.05
+    jumping = Signal(one_by_one, f"pose {layout}", "base").with_poses_as(layout, along=0)
+    assert torch.equal(jumping.values, episode.values)
+    assert episode.with_poses_as(layout, along=0).same_bits(episode)
+
+
+def test_only_quaternions_of_poses_are_continued_and_along_an_axis_that_there_is():
+    matrix = turning(31)
+    for kind in ("delta_pose matrix", "pose rotation"):
+        values = matrix[:, :3, :3] if kind.endswith("rotation") else matrix
+        given = Signal(values, kind, "base")
+        same = given.with_poses_as("xyz_quat_xyzw").same_bits(given.with_poses_as("xyz_quat_xyzw", along=0))
+        assert same == kind.startswith("delta")  # a motion goes on from none
+    quaternion = Signal(matrix, "pose matrix", "base").with_poses_as("xyz_quat_xyzw").values
+    beside = Signal(torch.cat([quaternion, -quaternion[:, :1]], dim=1), "pose xyz_quat_xyzw + invariant 1", "base")
+    found = beside.with_poses_as("xyz_quat_xyzw", along=0).values
+    assert torch.equal(found[:, 7], -quaternion[:, 0])
+    assert largest_step(found) < 0.2
+    assert beside.rows(slice(0, 0)).with_poses_as("xyz_quat_xyzw", along=0).values.shape == (0, 8)
+    joints = Signal(torch.rand(3), "invariant")
+    assert joints.with_poses_as("xyz_quat_xyzw", along=0).same_bits(joints)
+    for wrong in (1, -1, True, 0.0):
+        with pytest.raises(errors.ShapeError, match="along must be an axis on which poses follow each other, 0 to 0"):
+            beside.with_poses_as("xyz_quat_xyzw", along=wrong)
+
+
 def test_rewritten_poses_leave_the_columns_beside_them_and_rotations_stay_alone():
     pose = torch.tensor([[0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0, 0.7]])
     both = Signal(pose, "pose xyz_quat_xyzw + invariant 1", "base").with_poses_as("xyz_rot6d_rows")

@@ -15,7 +15,7 @@ from pcdata.errors import CaptureError, ConfigError, near_matches
 from pcdata.io.sources.lerobot_facts import DTYPES, IMAGES, SignalFacts
 from pcdata.io.sources.lerobot_files import INDEX_COLUMNS
 from pcdata.structures import DepthFrame, Signal
-from pcdata.structures.signal_kinds import poses_in_a_row
+from pcdata.structures.pose_rows import continued, poses_in_a_row
 
 _TASKS = ("task", "instruction", "language_instruction", "language")
 _INDEX_DTYPES = {"timestamp": "float32"}
@@ -161,11 +161,27 @@ def derived_columns(
     return _feature("float32", [width])
 
 
-def derived_value(names: Sequence[str], signals: Mapping[str, Signal], poses: str = "") -> NDArray[np.float32]:
-    """Return several signals in one row of numbers, their poses written as stated."""
-    parts = [(signals[name].kind, signals[name].values) for name in names]
-    rows = [poses_in_a_row(kind, values, poses)[1] for kind, values in parts if isinstance(values, Tensor)]
-    return torch.cat([row.reshape(-1).float() for row in rows]).numpy()
+def derived_value(
+    names: Sequence[str],
+    signals: Mapping[str, Signal],
+    poses: str = "",
+    before: NDArray[np.float32] | None = None,
+) -> NDArray[np.float32]:
+    """Return several signals in one row of numbers, their poses written as stated.
+
+    With the row of the step before quaternions have the sign nearest to it; those that are written as they were
+    recorded keep theirs.
+    """
+    rows: list[Tensor] = []
+    for name in names:
+        values = signals[name].values
+        if isinstance(values, Tensor):
+            kind, row = poses_in_a_row(signals[name].kind, values, poses)
+            if poses and before is not None:
+                start = sum(map(len, rows))
+                row = continued(kind, row, torch.from_numpy(before[start : start + row.numel()]).reshape(row.shape))
+            rows.append(row.reshape(-1).float())
+    return torch.cat(rows).numpy()
 
 
 def number_feature(dtype: str, shape: Sequence[int], names: Sequence[str] | None = None) -> dict[str, Any]:

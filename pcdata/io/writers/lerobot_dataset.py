@@ -136,6 +136,7 @@ class GrowingDataset:
         self._step = 0
         self._episode = episode
         self._of_episode: dict[str, list[NDArray[Any]]] = {}
+        self._before: dict[str, NDArray[np.float32]] = {}  # of the step before, by column
         for camera in self._cameras:
             camera.begin()
         self._tasks_of_episode: dict[str, None] = {}
@@ -156,7 +157,9 @@ class GrowingDataset:
             if one.column is not None:
                 row[one.column] = signal_value(one, frame.recorded_signals[name])
         for column, names in self._derived.items():
-            row[column] = derived_value(names, frame.recorded_signals, self._options.poses)
+            before = self._before.get(column)
+            row[column] = derived_value(names, frame.recorded_signals, self._options.poses, before)
+            self._before[column] = row[column]
         lost = [camera.add(row, frame) for camera in self._cameras]
         off, beyond = max(metres for metres, _ in lost), sum(values for _, values in lost)
         if off or beyond:

@@ -10,7 +10,7 @@ from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import ConfigError
 from pcdata.io.writers.lerobot_camera_files import ColorStorage, DepthStorage
 from pcdata.io.writers.writer import Writer
-from pcdata.structures.signal_kinds import checked_pose_layout
+from pcdata.structures.pose_rows import checked_pose_layout
 
 
 @dataclass(frozen=True, kw_only=True)

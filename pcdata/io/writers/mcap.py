@@ -20,6 +20,7 @@ import numpy as np
 from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError
+from pcdata.geometry.rotations import nearest_sign, quaternion_from_rotation
 from pcdata.io.images.writing import packed_color
 from pcdata.io.writers.file_names import file_names
 from pcdata.io.writers.registry import register_writer
@@ -119,6 +120,7 @@ class _Recording:
         self.writer, self.bag, self.messages, self.captures = writer, bag, messages, captures
         self._topics: dict[str, Any] = {}
         self._views: list[str] = []
+        self._turns: Tensor | None = None  # (V, 4) quaternions of the views in the capture before
         self._signals: dict[str, str] = {}  # what its topic is called, by name
         self._told = ""
         self._alike: tuple[tuple[int, int], set[str]] | None = None
@@ -154,8 +156,10 @@ class _Recording:
         for view, own in enumerate(self._views):
             self._add_view(frame.view(view) if frame.num_views > 1 else frame, own, stamp)
         if frame.world_from_camera is not None and frame.frame_id is not None:
-            poses = [(_optical(own), pose) for own, pose in zip(self._views, frame.world_from_camera)]
-            self._send("/tf", self.messages.transforms(stamp, frame.frame_id, poses), stamp)
+            turns = quaternion_from_rotation(frame.world_from_camera[:, :3, :3])
+            self._turns = turns if self._turns is None else nearest_sign(turns, self._turns)
+            places = zip(map(_optical, self._views), frame.world_from_camera[:, :3, 3], self._turns)
+            self._send("/tf", self.messages.transforms(stamp, frame.frame_id, [*places]), stamp)
         for name, signal in frame.recorded_signals.items():
             self._add_signal(name, signal, stamp)
 

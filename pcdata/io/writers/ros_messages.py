@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pcdata.extras import require
-from pcdata.geometry.rotations import quaternion_from_rotation
 from pcdata.structures import Camera
 
 _ENCODED = {  # type of the pixels, and whether they are of color: what ROS calls it
@@ -95,8 +94,8 @@ class RosMessages:
             roi=whole,
         )
 
-    def transforms(self, stamp: int, frame: str, poses: Sequence[tuple[str, Tensor]]) -> Any:
-        """Return the places of other frames in one: name and (4, 4) frame_from_other of each."""
+    def transforms(self, stamp: int, frame: str, poses: Sequence[tuple[str, Tensor, Tensor]]) -> Any:
+        """Return the places of other frames in one: name, position (3,) and quaternion (w, x, y, z) of each."""
         return self._made(
             "tf2_msgs/msg/TFMessage",
             transforms=[
@@ -104,9 +103,9 @@ class RosMessages:
                     "geometry_msgs/msg/TransformStamped",
                     header=self.header(stamp, frame),
                     child_frame_id=name,
-                    transform=self._transform(pose),
+                    transform=self._transform(position, turn),
                 )
-                for name, pose in poses
+                for name, position, turn in poses
             ],
         )
 
@@ -126,9 +125,9 @@ class RosMessages:
         """Return a text."""
         return self._made("std_msgs/msg/String", data=text)
 
-    def _transform(self, pose: Tensor) -> Any:
-        x, y, z = pose[:3, 3].tolist()
-        w, i, j, k = quaternion_from_rotation(pose[:3, :3]).tolist()
+    def _transform(self, position: Tensor, turn: Tensor) -> Any:
+        x, y, z = position.tolist()
+        w, i, j, k = turn.tolist()
         return self._made(
             "geometry_msgs/msg/Transform",
             translation=self._made("geometry_msgs/msg/Vector3", x=x, y=y, z=z),

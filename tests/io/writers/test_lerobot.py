@@ -360,6 +360,27 @@ def test_poses_in_the_state_are_position_and_rotation_in_the_layout_asked_for(tm
         convert(MadeCaptures(frames), "lerobot", tmp_path / "bad", poses="xyz_quat_xyzw")
 
 
+def test_quaternions_in_the_state_go_on_within_an_episode_and_begin_anew_with_the_next(tmp_path: Path) -> None:
+    frames = {}
+    for number in range(12):
+        half = 0.2 * (number + 5)  # w passes 0 within each episode
+        quaternion = torch.tensor([[0.1, 0.2, 0.3, 0.0, 0.0, np.sin(half), np.cos(half)]], dtype=torch.float64)
+        pose = Signal(quaternion, "pose xyz_quat_xyzw", "base").with_poses_as("xyz_rot6d_rows")
+        frame = made_frame(number).without_signal("action")
+        frames[f"{number:02d}"] = frame.with_signal("hand", pose.values, pose.kind, "base")
+    made = MadeCaptures(frames, [Episode("a", 0, 5), Episode("b", 5, 7)])
+    convert(made, "lerobot", tmp_path / "out", state="hand,hand", action="hand", poses="xyz_quat_wxyz")
+    table = parquet.read_table(tmp_path / "out" / ROWS)
+    for column in ("observation.state", "action"):
+        rows = np.array(table.column(column).to_pylist()).reshape(12, -1, 7)[:, :, 3:]
+        half = 0.2 * (np.arange(12) + 5)
+        wanted = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=1)[:, None]
+        assert np.abs(np.abs((rows * wanted).sum(-1)) - 1).max() < 1e-6
+        for steps in (slice(0, 5), slice(5, 12)):
+            assert (rows[steps.start, :, 0] >= 0).all()
+            assert np.linalg.norm(np.diff(rows[steps], axis=0), axis=-1).max() < 0.21  # half the angle of a step
+
+
 def test_a_dataset_without_its_facts_is_known_by_its_folders(tmp_path: Path) -> None:
     convert(MadeCaptures({"0": made_frame()}), "lerobot", tmp_path / "out")
     (tmp_path / "out" / "meta" / "info.json").unlink()

@@ -16,7 +16,7 @@ from rosbags.highlevel import AnyReader
 
 from pcdata import open_source
 from pcdata.errors import CaptureError, ConfigError
-from pcdata.geometry import rigid
+from pcdata.geometry import rigid, rotations
 from pcdata.io import convert
 from pcdata.structures import Episode, Signal
 from tests.io.writers.made_captures import MadeCaptures, cut_to_episodes, made_captures, made_frame
@@ -78,6 +78,23 @@ def test_cameras_have_their_intrinsics_lens_frame_and_place_in_the_tree(tmp_path
         assert torch.allclose(pose, frame.world_from_camera[view], rtol=0, atol=1e-12)
         ((_, exact),) = found[f"/{own}/pose_matrix"]
         assert np.array_equal(exact.data.reshape(4, 4), frame.world_from_camera[view])
+
+
+def test_a_camera_that_turns_has_quaternions_that_do_not_jump(tmp_path: Path) -> None:
+    frames = {}
+    for number in range(8):
+        angle = torch.tensor([[0.0, 2.0 + 0.3 * number, 0.0], [0.0, 0.0, 2.0 - 0.3 * number]], dtype=torch.float64)
+        poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
+        poses[:, :3, :3] = rotations.rotation_from_quaternion(rotations.quaternion_from_rotation_vector(angle))
+        frames[f"{number}"] = replace(made_frame(number, views=2), world_from_camera=poses)
+    convert(MadeCaptures(frames), "mcap", tmp_path / "out")
+    sent = [tf for _, tf in messages(tmp_path / "out" / "made.mcap")["/tf"]]
+    turns = np.array(
+        [[[getattr(one.transform.rotation, axis) for axis in "wxyz"] for one in tf.transforms] for tf in sent]
+    )
+    assert turns.shape == (8, 2, 4)
+    assert turns[0, 0, 0] > 0 > turns[-1, 0, 0]
+    assert np.linalg.norm(np.diff(turns, axis=0), axis=-1).max() < 0.16  # half the angle of a step
 
 
 def test_color_is_raw_unless_jpeg_is_asked_for_and_then_the_loss_is_told(tmp_path: Path) -> None:
