@@ -37,7 +37,8 @@ def signal_row(
     Raises:
         CaptureError: there is no such signal, or one that is no row of numbers.
     """
-    parts, signals = [], cloud.signals
+    parts: list[NDArray[np.float32]] = []
+    signals = cloud.signals
     for name in map(str.strip, names.split(",")):
         if name not in signals:
             known = ", ".join(signals) or "none"
@@ -68,7 +69,7 @@ def next_row(
     Raises:
         CaptureError: this cloud does not know the frame that one was recorded in.
     """
-    parts = []
+    parts: list[NDArray[np.float32]] = []
     for name in map(str.strip, names.split(",")):
         signal: Signal = following.recorded_signals[name]
         values: Any = signal.values
