@@ -15,8 +15,10 @@ from pcdata.contracts.on_host import bounds_of
 from pcdata.errors import NoPlaneError, UnitError
 from pcdata.functional.clusters import density_clusters
 from pcdata.functional.neighbor_rows import nearest_rows
+from pcdata.functional.normals import estimate_normals
 from pcdata.functional.plane_arguments import checked_probability, checked_seeds, checked_tilt, checked_up
 from pcdata.functional.plane_choice import chosen_plane
+from pcdata.functional.plane_slices import without_slices
 from pcdata.functional.plane_steps import near_planes, refine_planes
 from pcdata.functional.planes import ransac_plane
 from pcdata.functional.rows import ptr_from_counts
@@ -123,7 +125,7 @@ def segment_planes(
     min_share=checked_fraction,
     likely_up=checked_up,
     viewpoint=checked_places,
-    steps=(segment_planes, refine_planes, near_planes, nearest_rows, density_clusters),
+    steps=(segment_planes, refine_planes, near_planes, nearest_rows, estimate_normals, density_clusters),
     gradient=False,
 )
 def supporting_plane(
@@ -145,7 +147,8 @@ def supporting_plane(
     """Find the plane of each cloud that things stand on: the table, rather than a larger wall or the top of a box.
 
     The planes of a cloud (:func:`segment_planes`) are found among the means of its voxels of edge 2 ``distance``, so
-    what counts is area, however near the sensor or however often seen. Each scores its area, times one more than the
+    what counts is area, however near the sensor or however often seen; planes that cut through things lose what they
+    cut. Each scores its area, times one more than the
     area of what stands on it, times how level it is: 0.1 + max(0, cosine of its normal and up); the highest wins, the
     first found of equals. What stands on a plane is what is left without any plane, in connected parts that reach down
     to it, above it and over its convex hull, less what noise puts below it.
@@ -216,6 +219,7 @@ def supporting_plane(
                 f"{2 * distance:g}; is the table in the cloud, and distance in its unit?"
             )
         seen_from = torch.zeros(3, dtype=torch.float64, device="cpu") if viewpoint is None else viewpoint[b].cpu()
+        label = without_slices(means, label, planes, distance, backend)
         planes = _turned(planes.cpu(), own_up, seen_from)
         toward = own_up if own_up is not None else None if likely_up is None else likely_up[b].cpu()
         eye = seen_from if viewpoint is not None or up is None else None

@@ -62,7 +62,7 @@ MOST_WAITS = {
     "segment_planes": 177,
     "spatial_filter": 1,
     "statistical_outlier_mask": 7,
-    "supporting_plane": 544,
+    "supporting_plane": 550,
     "table_surface": 269,
     "undistort_depth": 11,
     "undistort_image": 11,

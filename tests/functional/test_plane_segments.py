@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, NoPlaneError, UnitError
-from pcdata.functional import ransac_plane, segment_planes, supporting_plane
+from pcdata.functional import ransac_plane, segment_planes, supporting_plane, voxel_downsample
+from pcdata.functional.plane_slices import without_slices
 from pcdata.rng import seeded
 from tests.tables import TABLE, WALL, box, rectangle, seen_from_camera
 
@@ -90,6 +91,24 @@ def test_an_empty_table_before_a_larger_wall_is_found_by_how_cameras_are_held(pi
     up = torch.tensor([0.0, -math.cos(math.radians(pitch)), -math.sin(math.radians(pitch))], dtype=torch.float64)
     assert abs(float(largest[0, :3] @ up)) < 0.1
     assert float(plane[0, :3] @ up) > 0.999
+
+
+@pytest.mark.parametrize("backend", ["torch", "auto"])
+def test_a_slice_through_boxes_loses_their_sides_and_surfaces_lose_nothing(backend):
+    table = rectangle((-0.5, -0.5, 0.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), seed=0, count=20_000)
+    things = [box((x, y, 0.0), (0.1, 0.08, 0.2), seed=4, count=6000) for x in (-0.3, 0.0, 0.3) for y in (-0.2, 0.2)]
+    voxels, _, _ = voxel_downsample(joined(table, *things), voxel_size=0.02)
+    planes = torch.tensor([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0, -0.1], [0.0, 0.0, 1.0, -0.2]], dtype=torch.float64)
+    apart = (voxels.double() @ planes[:, :3].T + planes[:, 3]).abs()
+    label = torch.where(apart.amin(1) < 0.01, apart.argmin(1), -1)
+    found = without_slices(voxels, label, planes, 0.01, backend)
+    before, after = (torch.bincount(one + 1, minlength=4)[1:].tolist() for one in (label, found))
+    assert after[0] > 0.97 * before[0]
+    assert after[1] < 0.3 * before[1]  # corners of boxes have no clear surface
+    assert after[2] > 0.7 * before[2]
+    assert bool(((found == label) | (found == -1)).all())
+    one = without_slices(voxels, label.clamp(max=0), planes[:1], 0.01, backend)
+    assert torch.equal(one, label.clamp(max=0))
 
 
 def test_up_and_a_limit_bind_the_search():

@@ -13,7 +13,15 @@ from pcdata.functional.plane_surfaces import plane_surfaces
 from pcdata.rng import seeded
 from pcdata.structures import PointCloud
 from pcdata.synthetic import tabletop
-from pcdata.transforms import Deproject, RemovePlane, plane_hulls_in_cloud, planes_in_cloud
+from pcdata.transforms import (
+    Compose,
+    Deproject,
+    RandomSensorNoise,
+    RemovePlane,
+    ToFrame,
+    plane_hulls_in_cloud,
+    planes_in_cloud,
+)
 from tests.rooms import seen_room, standing
 from tests.tables import TABLE as TABLE_SIZE
 from tests.tables import box, rectangle
@@ -44,6 +52,20 @@ def test_a_bare_table_wins_over_the_larger_floor_around_it(seed, num_objects, no
     scene = tabletop(seed, num_objects, size=(240, 320), noise=noise)
     plane = planes_in_cloud(STEP(Deproject()(scene.frame)))[0]
     assert float(plane[3]) == pytest.approx(float(scene.truth.world_from_camera[0, 2, 3]), abs=0.02)
+
+
+@pytest.mark.parametrize("fields", [{}, {"max_tilt": 0.2, "probability": 0.9999}], ids=["plain", "limited"])
+@pytest.mark.parametrize(
+    ("touching", "num_objects", "seed"),
+    [(True, 12, 3), (True, 20, 4), (True, 20, 7), (False, 12, 3), (False, 20, 2), (False, 20, 6)],
+)
+def test_no_slice_of_a_heap_is_the_table(touching, num_objects, seed, fields):
+    scene = tabletop(seed, num_objects, 1, size=(240, 320), touching=touching, floor=False)
+    steps = Compose([RandomSensorNoise(sensor="kinect_v1"), Deproject(), ToFrame(frame="base")])
+    cloud = steps(scene.frame, generator=seeded(seed))
+    table = RemovePlane(which="supporting", up=(0, 0, 1), frame="base", **fields)
+    plane = planes_in_cloud(table(cloud))[0]
+    assert torch.allclose(plane, torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=torch.float64), atol=0.005)
 
 
 @pytest.mark.parametrize("noise", [0.0, KINECT])
