@@ -146,7 +146,10 @@ def read_text(
     try:
         return read_bytes(where, path, max_bytes=max_bytes, inside=inside, error=error).decode("utf-8-sig")
     except UnicodeDecodeError as cause:
-        raise error(f"{told_at(where, path)}: must be UTF-8 text, but it is not: {cause}") from cause
+        raise error(
+            f"{told_at(where, path)}: must be UTF-8 text, but byte {cause.start} is none; is it another file, or "
+            "damaged?"
+        ) from cause
 
 
 def map_npy(

@@ -78,8 +78,10 @@ def json_object(where: str, text: str | bytes, *, error: type[PcdataError]) -> d
             _check_whole_characters(text)
         data = parse_json(text)
     except ValueError as cause:
-        way = "; it is damaged: copy it again, or make it anew" if issubclass(error, CacheError) else ""
-        raise error(f"{where}: not valid JSON: {str(cause)[:300]}{way}") from cause
+        ours = issubclass(error, CacheError)
+        way = "it is damaged: copy it again, or make it anew" if ours else "mend it there, or write it again"
+        fault = "it is no UTF-8 text" if isinstance(cause, UnicodeDecodeError) else str(cause)[:300]
+        raise error(f"{where}: not valid JSON: {fault}; {way}") from cause
     if not isinstance(data, dict):
         raise error(f"{where}: must be a JSON object, got a {type(data).__name__}")
     return data

@@ -80,7 +80,9 @@ def read_plain_pickle(where: str, program: bytes) -> Any:
     except CaptureError:
         raise
     except (ValueError, IndexError, KeyError, TypeError, OverflowError, RecursionError, MemoryError) as error:
-        raise CaptureError(f"{where}: is a damaged pickle ({type(error).__name__}: {str(error)[:200]})") from error
+        raise CaptureError(
+            f"{where}: is a damaged pickle ({type(error).__name__}: {str(error)[:200]}); copy or write it again"
+        ) from error
 
 
 class _Machine:

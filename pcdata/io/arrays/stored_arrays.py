@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pcdata.errors import CacheError, DTypeError, PcdataError, near_matches
+from pcdata.files.library_errors import WRITE_AGAIN, told_by_library
 from pcdata.files.npz import array_names, read_array
 from pcdata.files.opening import MAX_STREAMED_BYTES, existing_file, map_npy, open_input
 from pcdata.files.packing import check_packing
@@ -190,7 +191,4 @@ def _damage_named(where: str) -> Iterator[None]:
     except MemoryError as error:
         raise CacheError(f"{where}: there is not enough memory to read it ({error}); the file may be fine") from error
     except Exception as error:  # numpy and h5py raise many types on damaged bytes
-        raise CacheError(
-            f"{where}: cannot be read ({type(error).__name__}: {error}); damaged, cut short or of another format? "
-            "Copy or write it again"
-        ) from error
+        raise CacheError(f"{where}: cannot be read: {told_by_library(error)}; {WRITE_AGAIN}") from error

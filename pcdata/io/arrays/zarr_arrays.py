@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import CacheError, MissingExtraError
+from pcdata.files.library_errors import WRITE_AGAIN, told_by_library
 from pcdata.files.opening import check_inside, open_input, read_text
 from pcdata.files.packing import check_packing
 from pcdata.files.strict_json import parse_json
@@ -93,7 +94,9 @@ class _ZarrArray(ChunkGrid):
         except CacheError:
             raise
         except (ValueError, KeyError, TypeError, OverflowError) as error:
-            raise CacheError(f"{folder}: its .zarray cannot be read ({type(error).__name__}: {error})") from error
+            raise CacheError(
+                f"{folder}: its .zarray cannot be read: {told_by_library(error)}; {WRITE_AGAIN}"
+            ) from error
         if self.chunk_bytes > _MAX_CHUNK:
             raise CacheError(
                 f"{folder}: a chunk {self.chunks} of {dtype} has {self.chunk_bytes} bytes, more than {_MAX_CHUNK}"

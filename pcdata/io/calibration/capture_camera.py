@@ -16,6 +16,7 @@ from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError, PoseError, locates_path, near_matches
+from pcdata.files.number_words import number_of
 from pcdata.files.opening import map_npy, read_text, replacing
 from pcdata.files.strict_json import json_object
 from pcdata.functional.depth.unit_fit import DepthEncoding, check_depth_encoding
@@ -321,12 +322,6 @@ def _distortion(where: str, value: Any, lens: Any) -> list[float] | None:
 def _numbers(where: str, text: str) -> list[float]:
     words = text.replace(",", " ").split()
     try:
-        return [_plain_number(word) for word in words[:100]]
+        return [number_of(word) for word in words[:100]]
     except ValueError as error:
         raise CaptureError(f"{where}: must hold numbers only: {str(error)[:200]}") from error
-
-
-def _plain_number(word: str) -> float:
-    if "_" in word or not word.isascii():  # float() takes 1_000 and the digits of other scripts
-        raise ValueError(f"{word[:60]!r} is no number")
-    return float(word)

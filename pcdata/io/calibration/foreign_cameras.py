@@ -18,6 +18,8 @@ import torch
 from torch import Tensor
 
 from pcdata.errors import CaptureError, ConfigError, IntrinsicsError, PcdataError
+from pcdata.files.library_errors import told_by_library
+from pcdata.files.number_words import numbers_of
 from pcdata.files.opening import read_bytes, read_text
 from pcdata.files.strict_json import json_object
 from pcdata.functional.depth.unit_fit import DepthEncoding
@@ -75,7 +77,8 @@ def read_foreign_camera(
                 raise
             except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
                 raise CaptureError(
-                    f"{where}: is not as files of this name are: {type(error).__name__}: {str(error)[:200]}"
+                    f"{where}: is not as files of this name are: {told_by_library(error)}; is it another file, or "
+                    "damaged?"
                 ) from error
     return None
 
@@ -124,15 +127,6 @@ def _pinhole_at(size: Size, where: str, numbers: tuple[float, float, float, floa
         return pinhole(size, numbers, of_size=of_size)
     except PcdataError as error:
         raise IntrinsicsError(f"{where}: {error}") from error
-
-
-def numbers_of(text: str) -> list[float]:
-    """Return the numbers of a text, parted by white space or commas.
-
-    Raises:
-        ValueError: a word is no number.
-    """
-    return [float(word) for word in text.replace(",", " ").split()]
 
 
 def matrix_of(where: str, values: Sequence[Any], *, scale: float = 1.0) -> Tensor:  # (4, 4) float64, rigid

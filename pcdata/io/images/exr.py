@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pcdata.errors import CaptureError, PcdataError
 from pcdata.extras import require
+from pcdata.files.library_errors import WRITE_AGAIN, told_by_library
 from pcdata.files.opening import read_bytes
 
 MAGIC = b"\x76\x2f\x31\x01"
@@ -45,7 +46,7 @@ def read_exr_channel(where: str, path: Path, max_pixels: int) -> NDArray[np.floa
         with library.File(str(path), separate_channels=True) as file:
             channels = {name: np.asarray(one.pixels) for name, one in file.channels().items()}
     except Exception as error:  # its bindings raise RuntimeError and others on damaged blocks
-        raise CaptureError(f"{where}: not a readable OpenEXR image: {str(error)[:300]}") from error
+        raise CaptureError(f"{where}: not a readable OpenEXR image: {told_by_library(error)}; {WRITE_AGAIN}") from error
     return _one_channel(where, channels)
 
 

@@ -21,6 +21,7 @@ from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, UnitError, locates_path
+from pcdata.files.library_errors import WRITE_AGAIN, told_by_library
 from pcdata.files.opening import map_npy, open_input, read_bytes, told_at
 from pcdata.functional.depth.stored_depth import check_plausible, clean_float_depth, metres_of_value
 from pcdata.functional.depth.unit_fit import DepthEncoding, DepthUnit, check_depth_encoding
@@ -158,7 +159,7 @@ def image_size(where: str, path: Path) -> tuple[int, int]:
                 return image.height, image.width
         except _PARSERS as error:
             raise CaptureError(
-                f"{told_at(where, path)}: no readable image: {str(error) or type(error).__name__}"
+                f"{told_at(where, path)}: no readable image: {told_by_library(error)}; {WRITE_AGAIN}"
             ) from error
 
 
@@ -268,6 +269,8 @@ def decoded_image(where: str, data: bytes, formats: tuple[str, ...]) -> tuple[st
             if (reals := read_reals(data, _bytes_of_tiff)) is not None:
                 return "F", reals, depth
         else:
+            if _PNG in formats and data[:2] != b"\xff\xd8":
+                raise StructureError("it starts as neither a PNG nor a JPEG does")
             check_jpeg(data, MAX_PIXELS)
         with Image.open(io.BytesIO(data), formats=formats) as image:
             check_pixels(where, *image.size)
@@ -277,9 +280,12 @@ def decoded_image(where: str, data: bytes, formats: tuple[str, ...]) -> tuple[st
             return image.mode, np.asarray(image), depth
     except CaptureError:
         raise
+    except StructureError as error:
+        way = "" if ";" in str(error) else "; copy or write it again"
+        raise CaptureError(f"{where}: not a readable {' or '.join(formats)} image: {error}{way}") from error
     except _PARSERS as error:
         raise CaptureError(
-            f"{where}: not a readable {' or '.join(formats)} image: {str(error) or type(error).__name__}"
+            f"{where}: not a readable {' or '.join(formats)} image: {told_by_library(error)}; {WRITE_AGAIN}"
         ) from error
 
 

@@ -18,7 +18,8 @@ from typing import BinaryIO, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import CaptureError, PcdataError, add_note
+from pcdata.errors import CaptureError, PcdataError
+from pcdata.files.library_errors import name_file, told_by_library
 from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
 
 MAX_MESSAGE = 1 << 28  # bytes: four times an image of 67 megapixels
@@ -135,10 +136,10 @@ def said_of(path: Path) -> Iterator[None]:
     try:
         yield
     except PcdataError as error:
-        add_note(error, f"while reading {path}")
+        name_file(error, path, str(path))
         raise
     except (OSError, ValueError, struct.error, IndexError, KeyError, OverflowError, MemoryError, EOFError) as error:
-        raise CaptureError(f"{path}: is damaged: {type(error).__name__}: {str(error)[:300]}") from error
+        raise CaptureError(f"{path}: is damaged: {told_by_library(error)}; copy it again") from error
 
 
 def by_topic(messages: dict[str, list[tuple[int, int, int]]], index: Index) -> None:

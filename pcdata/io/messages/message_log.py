@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from pcdata.errors import CaptureError
-from pcdata.files.opening import check_inside, read_text
+from pcdata.files.library_errors import WRITE_AGAIN
+from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, existing_file, read_text
 from pcdata.io.messages.bag_file import BagFile
 from pcdata.io.messages.log_file import MAX_MESSAGE, LogFile, Topic
 from pcdata.io.messages.mcap_file import McapFile
@@ -119,7 +120,8 @@ def opened_log(where: str, path: Path, links_to: tuple[Path, ...] = ()) -> Messa
     if not path.is_dir():
         container = container_of(path)
         if container is None:
-            raise CaptureError(f"{where}: is no ROS 1 bag, MCAP file or ROS 2 bag")
+            existing_file(where, path, max_bytes=MAX_STREAMED_BYTES)  # one that is empty says so
+            raise CaptureError(f"{where}: does not begin as a ROS 1 bag, an MCAP file or a ROS 2 bag; {WRITE_AGAIN}")
         return MessageLog([container(path)])
     told = _metadata(where, path, links_to)
     names = told.get("relative_file_paths")

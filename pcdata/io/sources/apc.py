@@ -16,9 +16,10 @@ from typing import Any
 from torch import Tensor
 
 from pcdata.errors import CaptureError
+from pcdata.files.number_words import numbers_of
 from pcdata.files.opening import read_text
 from pcdata.files.sample_names import name_some
-from pcdata.io.calibration.foreign_cameras import check_motion, matrix_of, numbers_of, pinhole_of_matrix
+from pcdata.io.calibration.foreign_cameras import check_motion, matrix_of, pinhole_of_matrix
 from pcdata.io.images.reading import read_depth
 from pcdata.io.sources.listed import ListedSource, StoredView, checked_folder, files_by_id
 from pcdata.io.sources.listing import LinkTargets, is_file, is_folder, link_targets

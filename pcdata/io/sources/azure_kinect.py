@@ -14,7 +14,7 @@ from typing import Any, BinaryIO
 from torch import Tensor
 
 from pcdata.errors import CaptureError, IntrinsicsError, PcdataError
-from pcdata.files.sample_names import name_some
+from pcdata.files.sample_names import counted, name_some
 from pcdata.files.strict_json import json_object
 from pcdata.io.calibration.foreign_cameras import matrix_of, pinhole
 from pcdata.io.sources.matroska import MAGIC, opened_matroska
@@ -72,6 +72,10 @@ class _AzureKinectSource(RecordingSource):
             self._calibration = _cameras(where, said)
             depth_times, *color_times = recording.times(*read)
             tags = recording.tags()
+            cut = f"it is cut short: {recording.missing} bytes are missing at its end" if recording.missing else ""
+        if not depth_times:
+            way = f"{cut}; copy it again from where it was recorded" if cut else "was the recording stopped at once?"
+            raise CaptureError(f"{where}: its track DEPTH has no image; {way}")
         serial = {"serial": tags["K4A_DEVICE_SERIAL_NUMBER"]} if "K4A_DEVICE_SERIAL_NUMBER" in tags else {}
         return Recorded(
             depth_times=depth_times,
@@ -79,9 +83,12 @@ class _AzureKinectSource(RecordingSource):
             metres_per_unit=_UNIT,
             sensor={"sensor_name": "Azure Kinect", **serial},
             unread=[
-                f"track {name}; {READ_COLOR}" if name == "COLOR" else f"track {name}"
-                for name in tracks
-                if name not in read
+                *([f"{path.name}: {cut}; {counted(len(depth_times), 'depth image')} can be read"] if cut else []),
+                *(
+                    f"track {name}; {READ_COLOR}" if name == "COLOR" else f"track {name}"
+                    for name in tracks
+                    if name not in read
+                ),
             ],
         )
 

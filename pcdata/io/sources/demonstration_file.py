@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pcdata.errors import CacheError, CaptureError, PcdataError
+from pcdata.files.library_errors import WRITE_AGAIN, told_by_library
 from pcdata.files.opening import MAX_STREAMED_BYTES, existing_file
 from pcdata.files.sample_names import in_order
 from pcdata.files.strict_json import json_object
@@ -40,10 +41,7 @@ def opened(where: str, path: Path) -> Iterator[Any]:
     except MemoryError as error:
         raise CaptureError(f"{where}: there is not enough memory to read it ({error}); the file may be fine") from error
     except Exception as error:  # h5py raises many types on damaged bytes
-        raise CaptureError(
-            f"{where}: cannot be read ({type(error).__name__}: {str(error)[:200]}); damaged, cut short or of another "
-            "format? Copy or write it again"
-        ) from error
+        raise CaptureError(f"{where}: not a readable HDF5 file: {told_by_library(error)}; {WRITE_AGAIN}") from error
 
 
 def episode_names(where: str, group: Any, prefix: str) -> list[str]:

@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pcdata.errors import CaptureError, PcdataError, add_note
+from pcdata.errors import CaptureError, PcdataError
 from pcdata.extras import require
+from pcdata.files.library_errors import name_file, told_by_library
 from pcdata.files.opening import MAX_STREAMED_BYTES, open_input
 from pcdata.io.images.ffv1 import decoded
 from pcdata.io.images.reading import check_pixels
 
 MAGIC = b"\x1a\x45\xdf\xa3"
+_SEGMENT = b"\x18\x53\x80\x67"  # the name of what holds all tracks
 _MAX_ATTACHMENT = 1 << 24
 _MAX_TRACKS = 64
 _GRAY, _GRAYS = "gray16le", ("gray16le", "gray16be")  # converting others to it would invent numbers
@@ -27,10 +30,11 @@ _GRAY, _GRAYS = "gray16le", ("gray16le", "gray16be")  # converting others to it 
 class _Matroska:
     """An open recording; times are seconds on its own clock."""
 
-    def __init__(self, container: Any) -> None:
+    def __init__(self, container: Any, missing: int) -> None:
         if len(container.streams) > _MAX_TRACKS:
             raise CaptureError(f"it has {len(container.streams)} tracks; no recorder writes so many")
         self._container = container
+        self.missing = missing  # bytes that the file says it has and has not: it is cut short
 
     def tracks(self) -> dict[str, dict[str, str]]:
         """Return the tags of every picture track, by its title."""
@@ -92,6 +96,29 @@ class _Matroska:
         raise CaptureError(f"it has no track {title}; it has {', '.join(self.tracks()) or 'none'}")
 
 
+def _missing_bytes(stream: BinaryIO) -> int:
+    """Return how many bytes the one segment of a file ends beyond it; 0 where its length was not written.
+
+    Source: RFC 8794, Extensible Binary Meta Language: an element is its name, its length and that many bytes.
+    """
+    stream.seek(len(MAGIC))
+    stream.seek(_length(stream) or 0, os.SEEK_CUR)  # over the header
+    if stream.read(len(_SEGMENT)) != _SEGMENT or (length := _length(stream)) is None:
+        return 0
+    return max(0, stream.tell() + length - os.fstat(stream.fileno()).st_size)
+
+
+def _length(stream: BinaryIO) -> int | None:
+    """Read a length: as many bytes as the first has zeros before its first 1, all ones = unknown."""
+    first = (stream.read(1) or b"\0")[0]
+    if not first:
+        return None
+    count = 8 - first.bit_length()
+    rest = stream.read(count)
+    value = int.from_bytes(bytes([first ^ (1 << (7 - count))]) + rest, "big")
+    return None if len(rest) < count or value == (1 << 7 * (count + 1)) - 1 else value
+
+
 @contextmanager
 def opened_matroska(where: str, path: Path) -> Iterator[_Matroska]:
     """Open a recording.
@@ -106,16 +133,17 @@ def opened_matroska(where: str, path: Path) -> Iterator[_Matroska]:
         with open_input(where, path, max_bytes=MAX_STREAMED_BYTES) as stream:
             if stream.read(len(MAGIC)) != MAGIC:
                 raise CaptureError("it does not start as a Matroska file does")
+            missing = _missing_bytes(stream)
             stream.seek(0)
             with av.open(
                 stream, mode="r", format="matroska"
             ) as container:  # no other format, and no other file, is opened
-                yield _Matroska(container)
+                yield _Matroska(container, missing)
     except PcdataError as error:
-        add_note(error, f"while reading {where}")
+        name_file(error, path, where)
         raise
     except Exception as error:  # FFmpeg's errors are of many types, some of them of Python's own
         raise CaptureError(
-            f"{where}: not a readable recording: {type(error).__name__}: {str(error)[:300]}; the file is damaged or "
-            "cut short: copy it again from where it was recorded"
+            f"{where}: not a readable recording: {told_by_library(error)}; the file is damaged or cut short: copy it "
+            "again from where it was recorded"
         ) from error

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError, PcdataError
+from pcdata.files.number_words import numbers_of
 from pcdata.files.opening import read_text
 from pcdata.files.sample_names import in_order, name_some
-from pcdata.io.calibration.foreign_cameras import matrix_of, numbers_of, read_foreign_camera
+from pcdata.io.calibration.foreign_cameras import matrix_of, read_foreign_camera
 from pcdata.io.images.reading import read_depth
 from pcdata.io.sources.listed import ListedSource, StoredView, checked_folder, files_by_id
 from pcdata.io.sources.listing import LinkTargets, entries, has_file, has_folder, is_file, is_folder, link_targets

@@ -20,8 +20,10 @@ import torch
 from torch import Tensor
 
 from pcdata.contracts.lengths import check_metres_per_unit
-from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, UnitError, add_note
+from pcdata.errors import CaptureError, IntrinsicsError, PcdataError, UnitError
 from pcdata.extras import require
+from pcdata.files.library_errors import name_file
+from pcdata.files.opening import MAX_STREAMED_BYTES, existing_file
 from pcdata.geometry import rigid
 from pcdata.io.calibration.stated_lens import lens_of
 from pcdata.io.messages.bag_file import BagFile, bag_topics
@@ -90,6 +92,7 @@ class _RealSenseBagSource(RecordingSource):
     def _open(self, where: str, path: Path, registered: bool) -> Recorded:
         require("rosbags")
         if not self._is_recording(path):
+            existing_file(where, path, max_bytes=MAX_STREAMED_BYTES)  # one that is empty says so
             raise CaptureError(f"{where}: is no bag of a RealSense; this layout needs {self.needs}")
         with _said_of(where):
             bag = _Bag(MessageLog([BagFile(path)]))
@@ -123,7 +126,7 @@ def _said_of(where: str) -> Iterator[None]:
     try:
         yield
     except PcdataError as error:
-        add_note(error, f"while reading {where}")
+        name_file(error, where, where)
         raise
 
 

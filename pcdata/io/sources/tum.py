@@ -14,6 +14,7 @@ import numpy as np
 
 from pcdata.contracts.lengths import check_metres_per_unit
 from pcdata.errors import CaptureError
+from pcdata.files.number_words import number_of
 from pcdata.files.opening import read_text
 from pcdata.io.calibration.foreign_cameras import pinhole
 from pcdata.io.images.reading import read_depth
@@ -172,7 +173,7 @@ def _file_list(file: Path, folder: Path, allowed: list[Path]) -> list[tuple[floa
 def _trajectory(file: Path, allowed: list[Path]) -> Trajectory:
     rows = _rows(file, allowed, 8)
     try:
-        numbers = np.array([[float(word) for word in row] for row in rows], np.float64).reshape(-1, 8)
+        numbers = np.array([[number_of(word) for word in row] for row in rows], np.float64).reshape(-1, 8)
     except ValueError as error:
         raise CaptureError(f"{file}: must hold numbers: {str(error)[:200]}") from error
     return Trajectory(str(file), [_time(file, row[0]) for row in rows], numbers[:, 1:4], numbers[:, 4:])

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pcdata.errors import CacheError, ConfigError, locate, write_fault
+from pcdata.files.library_errors import told_by_library
 from pcdata.files.opening import MAX_STREAMED_BYTES, check_inside, open_input
 from pcdata.files.urls import UrlFolder
 from pcdata.files.zip_archive import ZipArchive
@@ -236,7 +237,6 @@ def _damage(path: Path | str, error: Exception) -> CacheError:
         return CacheError(f"{path}: there is not enough memory to read it ({error}); the file may be fine")
     if isinstance(error, OSError) and error.errno in (errno.EACCES, errno.EPERM, errno.EMFILE, errno.ENFILE):
         return CacheError(f"{path}: cannot be opened: {error}; the file itself may be fine")
-    kind = type(error).__name__
     return CacheError(
-        f"{path}: cannot be read ({kind}: {error}); the file is damaged or truncated: rebuild the dataset"
+        f"{path}: cannot be read: {told_by_library(error)}; the file is damaged or truncated: rebuild the dataset"
     )

@@ -39,6 +39,7 @@ from pcdata.io.sources.registry import fields_of, options_of
 from pcdata.structures import DepthFrame
 from pcdata.synthetic import SyntheticSource, TeleopSource
 from tests.captures import CAPTURES, OPTIONS, folder_capture, graspnet_capture, seven_scenes_capture
+from tests.files.test_library_errors import FOREIGN
 from tests.messages import told
 from tests.warm import run_python
 
@@ -163,6 +164,33 @@ def test_what_is_cut_or_gone_after_opening_is_a_typed_error(name: str, tmp_path:
     files[0].unlink()
     with pytest.raises(CaptureError, match="no such file"):
         source.load(last)
+
+
+@pytest.mark.parametrize("name", LAYOUTS)
+def test_a_damaged_file_is_named_in_words_of_ours(name: str, tmp_path: Path) -> None:
+    """Whichever file it is; where nothing reads it, or what it lost is not needed, the capture may load."""
+    root = tmp_path / "captures"
+    path = CAPTURES[name](root)
+    known = {(file.parent.name, file.suffix): file for file in sorted(root.rglob("*")) if file.is_file()}
+    for file in known.values():
+        whole = file.read_bytes()
+        for damaged in (whole[: len(whole) // 2], bytes(64) + whole[64:], b"\xfe" * len(whole)):
+            file.write_bytes(damaged)
+            if told := fault_of(lambda: open_source(path, kind=name, **OPTIONS.get(name, {}))):
+                assert file.stem in told or file.parent.name in told, f"{file}: {told}"
+                assert not [word for word in FOREIGN if word in told], f"{file}: {told}"
+        file.write_bytes(whole)
+
+
+def fault_of(opened: Callable[[], CaptureSource]) -> str:
+    """What is told of the first fault of a source or its captures; empty where it has none."""
+    try:
+        source = opened()
+        for sample_id in source.ids:
+            source.load(sample_id)
+    except PcdataError as error:
+        return str(error)
+    return ""
 
 
 @pytest.mark.parametrize("name", ["seven_scenes", "rlbench"])
