@@ -18,7 +18,7 @@ LIMITS = {  # calls, files; counted with Python before 3.12, where comprehension
     "live": (553, 49),
     "build": (
         3300,
-        119,  # the options have a file of their own, and so do numbers in words, what the core finds of planes, and motions
+        119,  # the options have a file of their own, and so do numbers in words, what the core finds of planes, motions
     ),  # of which 600 keep what a build was when it is stopped, 700 write its card, 30 tell rows, 16 look at poses, 56
     # have the hull and the rows of a plane found by the core, on one thread of torch's, 15 and 2 files tell its surface
     "open": (
