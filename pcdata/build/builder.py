@@ -23,6 +23,7 @@ from pcdata.files.sample_names import counted
 from pcdata.files.scratch import Note
 from pcdata.io.sources.capture_source import CaptureSource, skipped_of
 from pcdata.progress import Progress
+from pcdata.validation.first_look import judge_of_all
 from pcdata.validation.step_losses import judge_step_losses
 
 
@@ -35,6 +36,7 @@ class BuildReport:
     skipped: dict[str, str] = field(default_factory=dict)  # id of a capture that was left out -> why
     quarantined: dict[str, str] = field(default_factory=dict)  # id of a capture that failed twice -> why
     notes: list[str] = field(default_factory=list)  # what was found of builds before, and what became of it
+    look: str = ""  # what the captures of the first shard tell of a wrong unit of depth or of wrong poses
     num_shards: int = 0
     num_finished: int = 0  # of them; fewer where others have a part of the work
     is_complete: bool = False  # the dataset is under its name
@@ -156,7 +158,7 @@ def _built(
         if asked.finalize and len(done) < plan.num_shards:
             missing = plan.num_shards - len(done)
             raise CacheError(f"{folder}: {missing} of {plan.num_shards} shards are not finished; build them first")
-        tally = Tally(plan, shards, done, limit, progress)
+        tally = Tally(plan, shards, done, limit, progress, lambda look: tell(f"{look} {judge_of_all(source)}"))
         try:
             _work(job, [shard for shard in shards if shard not in done], tally, asked)
         except BaseException as error:
@@ -264,4 +266,5 @@ def _told(
     for record in records:
         report.samples.extend(record.samples)
         report.quarantined.update(record.quarantined)
-    return replace(report, num_shards=num_shards, num_finished=num_finished, is_complete=is_complete)
+    look = next((record.look for record in records if record.look), "")
+    return replace(report, look=look, num_shards=num_shards, num_finished=num_finished, is_complete=is_complete)

@@ -18,7 +18,7 @@ from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.io.store.cloud_record import Record, record_from_cloud
 from pcdata.io.writers.capture_folder import write_capture
 from pcdata.structures import DepthFrame, PointCloud, Signal
-from pcdata.transforms import Compose, Transform
+from pcdata.transforms import Compose, FuseTSDF, ToFrame, Transform
 from pcdata.transforms.decisions import Decision
 
 
@@ -41,6 +41,10 @@ class CaptureWork:
         self.keep_raw = config.output.keep_raw
         self.compact = config.output.compact
         self.source = source
+        self.by_pose = any(
+            isinstance(step, FuseTSDF) or (isinstance(step, ToFrame) and step.matrix is None)
+            for step in config.pipeline.parts()
+        )
 
     def make(self, sample_id: str, inputs: Inputs) -> Made:
         """Load and process one capture.

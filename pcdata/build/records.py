@@ -45,6 +45,7 @@ class ShardRecord:
     signals: Mapping[str, str] = field(default_factory=dict)  # as a manifest has them, of this shard
     files: Mapping[str, int] = field(default_factory=dict)  # bytes of each
     origins: list[dict[str, Any]] = field(default_factory=list)  # where the samples come from, with counts
+    look: str = ""  # what its captures tell of a wrong unit or of wrong poses, in words; the first shard is looked at
 
     @property
     def folder_name(self) -> str:
@@ -77,6 +78,7 @@ class ShardRecord:
                 (schema, record.identity, record.shard) == (SCHEMA, plan.identity, shard)
                 and [sample.id for sample in samples] == ids
                 and folder == record.folder_name
+                and isinstance(record.look, str)
             )
         except (TypeError, ValueError, KeyError, AttributeError) as error:
             raise CacheError(f"{where}: is no record of a shard: {error}") from error

@@ -31,6 +31,7 @@ from pcdata.io.store.shards import SIGNALS_KEY, seal_shard
 from pcdata.io.store.stores import STORES, Compression
 from pcdata.structures import Signal
 from pcdata.structures.signal_joining import stacked_signals
+from pcdata.validation.first_look import FirstLook
 
 
 class Watch(Protocol):
@@ -93,6 +94,7 @@ class _ShardWork:
         self.quarantined = dict(given_up)
         self.failed_once: set[str] = set()
         self.origins: list[Origin] = []  # of the samples that are stored
+        self.look = ""
 
     def run(self) -> ShardRecord:
         """Work until every capture is stored or quarantined."""
@@ -115,6 +117,7 @@ class _ShardWork:
                     told,
                     folder.sizes_on_disk(scratch / SHARD),
                     joined(self.origins),
+                    self.look,
                 )
                 folder.commit(scratch, record)
                 return record
@@ -129,6 +132,8 @@ class _ShardWork:
         signals: list[Mapping[str, Signal]] = []
         failed: dict[str, str] = {}
         self.origins.clear()
+        look = FirstLook(by_pose=job.work.by_pose) if self.shard == 0 else None
+        told: str | None = None
         with closing(STORES[job.format](scratch / SHARD, job.compression)) as store:
             for sample_id in ids:
                 if sample_id in self.quarantined:
@@ -152,7 +157,10 @@ class _ShardWork:
                 self.origins.append(made.origin)
                 signals.append(made.signals)
                 self.watch.ends(sample_id, None)
+                if look is not None:
+                    told = look.see(made.capture) or told
             inputs.check("build_dataset")
+        self.look = told or (look is not None and look.end()) or ""
         return samples, failed, captures, signals
 
     def _tried_again(self, failed: Mapping[str, str]) -> bool:

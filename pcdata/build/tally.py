@@ -10,6 +10,7 @@ from pcdata import errors
 from pcdata.build.plan import Plan
 from pcdata.build.records import ShardRecord
 from pcdata.errors import CacheError, CaptureError, ConfigError, PcdataError, add_note, locate
+from pcdata.files.scratch import Note
 from pcdata.progress import Progress
 
 _STARVED = 3  # captures in shards one after another that lack memory: the machine is at fault, not they
@@ -43,6 +44,7 @@ class Tally:
         finished: Mapping[int, ShardRecord],
         limit: int | None,
         progress: Progress | None,
+        note: Note,
     ) -> None:
         """Begin with the shards that are finished.
 
@@ -52,11 +54,12 @@ class Tally:
             finished: of all shards.
             limit: how many captures may be quarantined in all.
             progress: told of the captures of ``shards``.
+            note: told what a look at captures finds, as soon as their shard is finished.
 
         Raises:
             CaptureError: more are quarantined than may be.
         """
-        self._num_samples, self._limit, self._progress = len(plan.ids), limit, progress
+        self._num_samples, self._limit, self._progress, self._note = len(plan.ids), limit, progress, note
         self._total = sum(len(plan.ids_of(shard)) for shard in shards)
         self._num_done = sum(len(plan.ids_of(shard)) for shard in shards if shard in finished)
         self._any_stored = any(record.samples for record in finished.values())
@@ -64,6 +67,8 @@ class Tally:
         self._num_starved = 0
         self._first: dict[str, str] = {}  # the captures that failed before any was stored
         self._open: dict[int, set[str]] = {}  # captures that are done, of shards that are not
+        for record in finished.values():
+            self._tell_look(record)
         self._check()
 
     def captured(self, shard: int, sample_id: str, error: str | None) -> None:
@@ -92,6 +97,7 @@ class Tally:
         self._any_stored |= bool(record.samples)
         self._num_done += len(record.samples) + len(record.quarantined)
         self._quarantined.update(record.quarantined)
+        self._tell_look(record)
         self._check()
         starved = [name for name, why in record.quarantined.items() if why.startswith(MemoryError.__name__)]
         self._num_starved = self._num_starved + len(starved) if starved else 0
@@ -100,6 +106,10 @@ class Tally:
                 f"build_dataset: the memory does not suffice for {starved[-1]!r} and others before it; what is "
                 "finished is kept, and the same command, perhaps with fewer --workers, goes on and tries them again"
             )
+
+    def _tell_look(self, record: ShardRecord) -> None:
+        if record.look:
+            self._note(record.look)
 
     def _check(self) -> None:
         if self._limit is not None and len(self._quarantined) > self._limit:

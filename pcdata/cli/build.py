@@ -14,7 +14,7 @@ from pcdata.cli.options import add_capture_options, given_options, skip_list
 from pcdata.cli.progress_bar import ProgressBar
 
 if TYPE_CHECKING:
-    from pcdata.build import BuildConfig, BuildReport
+    from pcdata.build import BuildConfig
 
 _SHOWN = 20  # of what lies beside the captures and is not read
 QUARANTINED = 3  # exit code: the dataset is there, but some captures are not in it
@@ -127,6 +127,7 @@ def _build(arguments: argparse.Namespace) -> int:
     from pcdata.io.sources.capture_source import unread_of
     from pcdata.io.store.url_dataset import is_read_at_urls
     from pcdata.report.build_text import build_text, notes_of, plan_text
+    from pcdata.validation.first_look import judge_of_all
 
     config = _config(arguments)
     if arguments.print_config:
@@ -163,26 +164,12 @@ def _build(arguments: argparse.Namespace) -> int:
         print(f"\ndataset  {report.folder}{loads}")
         if not isinstance(report.folder, Path) and not is_read_at_urls(config.output.format):
             print(f"         {config.output.format} is read from a copy on the disk; webdataset also where it is")
-        path = arguments.source or str(getattr(source, "path", "SOURCE"))
-        for note in [*notes_of(config, report), *_look(config, source, report, path)]:
+        look = [f"{report.look} {judge_of_all(source, arguments.source or '')}"] if report.look else []
+        for note in [*notes_of(config, report), *look]:
             print(f"note     {note}")
         if report.quarantined and isinstance(report.folder, Path):
             print("         once the cause is mended, the same command with --retry-quarantined tries those again")
     return QUARANTINED if report.quarantined and arguments.max_bad is None else 0
-
-
-def _look(config: BuildConfig, source: Any, report: BuildReport, path: str) -> list[str]:
-    """Say that the clouds are of another size than things are, or lie elsewhere, as a look at a few captures tells."""
-    from pcdata.transforms import FuseTSDF, ToFrame
-    from pcdata.validation.first_look import first_look
-
-    by_pose = any(
-        isinstance(step, FuseTSDF) or (isinstance(step, ToFrame) and step.matrix is None)
-        for step in config.pipeline.parts()
-    )
-    # Only what a worker has loaded: a capture may hang, or end the process that reads it.
-    told = first_look(source, [sample.id for sample in report.samples], path, by_pose=by_pose)
-    return [] if told is None else [told]
 
 
 def _config(arguments: argparse.Namespace) -> BuildConfig:

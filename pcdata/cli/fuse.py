@@ -49,7 +49,7 @@ def _fuse(arguments: argparse.Namespace) -> None:
     from pcdata.io import write_ply, write_volume
     from pcdata.io.sources.capture_source import check_apart
     from pcdata.structures import TSDFVolume
-    from pcdata.validation.first_look import first_look
+    from pcdata.validation.first_look import FirstLook, judge_of_all
 
     volume = TSDFVolume(
         voxel_size=arguments.voxel_size,
@@ -61,10 +61,13 @@ def _fuse(arguments: argparse.Namespace) -> None:
     source = open_captures(arguments.path, arguments, limit=arguments.limit)
     check_apart("fuse: --out", out, source)
     with ProgressBar("fuse") as progress:
-        if told := first_look(source, source.ids, arguments.path):
-            progress.note(told)
+        look = FirstLook()
         for done, sample_id in enumerate(source.ids, 1):
-            volume.integrate(source.load(sample_id))
+            capture = source.load(sample_id)
+            told = look.see(capture)
+            if told := told or (look.end() if done == len(source) else None):
+                progress.note(f"{told} {judge_of_all(source, arguments.path)}")
+            volume.integrate(capture)
             progress(done, len(source), sample_id)
     least = arguments.min_weight or 0.0
     if out.suffix == ".npz":

@@ -1,12 +1,12 @@
-"""A look at a few captures for a wrong unit of depth, and for poses that lead elsewhere."""
+"""A look at a few captures, while they are read, for a wrong unit of depth, and for poses that lead elsewhere."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 from pcdata.errors import PcdataError
-from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.threads import torch_on_one_thread
 from pcdata.validation import checks as _checks  # noqa: F401  # registers them
@@ -20,44 +20,104 @@ _PLACES = (0, 1, 2, 4, 8, 16, 32, 64)  # of captures in order: near enough to se
 _SUBJECTS = {UNIT: "the unit of depth looks", POSES: "the poses look"}
 
 
-@torch_on_one_thread()
-def first_fault(captures: Iterable[DepthFrame | PointCloud], *, by_pose: bool = True) -> Finding | None:
-    """Return the check of the unit, or else of the poses, that fails for captures in their order; None = neither does.
+class FirstLook:
+    """A look at some of the captures that somebody reads anyway, in their order; none is read for it, one is kept.
 
     The unit is that of the first capture. Poses are judged within it, where it has several views, or else from capture
-    to capture. What cannot be read or measured says nothing here: whoever uses it is told then.
+    to capture: up to the 65th, or the last where there are fewer. What cannot be measured says nothing here.
     """
-    limits, found = CaptureLimits(), list[Finding]()
-    of_poses = [(check, check.memory()) for check in _named(POSES)]
-    try:
-        for number, capture in enumerate(captures):
-            if not isinstance(capture, DepthFrame):
-                return None
-            for check in _named(UNIT) if number == 0 else ():
-                judged = check.judge(capture, limits, (), *check.memory())
-                if fault := _failed(UNIT, judged):
-                    return fault  # of depth that is known to be wrong no pose can be told
-            if not by_pose or capture.world_from_camera is None:
-                return None
-            for check, memory in of_poses:
-                found += check.judge(capture, limits, (), *memory)
-            if capture.num_views > 1:
-                break
-        for check, memory in of_poses:
-            found += check.whole(*memory, limits) if check.whole is not None else []
-    except PcdataError:
-        return None
-    return _failed(POSES, found[::-1])  # what is said of all captures together is surer than what is said of one
+
+    def __init__(self, *, by_pose: bool = True) -> None:
+        """Begin; ``by_pose``: whether poses decide where anything goes."""
+        self._look = _Look(by_pose)
+        self._number = 0
+        self._latest: DepthFrame | PointCloud | None = None  # the last one, where it was not looked at
+
+    def see(self, capture: DepthFrame | PointCloud) -> str | None:
+        """Take the next capture; return what is wrong, in words, as soon as that is certain, and once."""
+        number, self._number = self._number, self._number + 1
+        if self._look.is_done:
+            return None
+        self._latest = capture
+        if number in _PLACES:
+            self._latest = None
+            self._look.at(capture)
+        return self.end() if number == _PLACES[-1] or self._look.is_done else None
+
+    def end(self) -> str | None:
+        """Take that there are no more captures; return what is wrong, unless it was told before."""
+        if self._latest is not None and not self._look.is_done:
+            self._look.at(self._latest)
+        self._latest = None
+        finding = self._look.concluded()
+        return None if finding is None else f"{_SUBJECTS[finding.name]} wrong: {finding.found}; {finding.advice}"
 
 
-def first_look(source: CaptureSource, ids: Sequence[str], path: str, *, by_pose: bool = True) -> str | None:
-    """Say in words what :func:`first_fault` finds in a few captures of these, and what judges all of the source."""
-    some = (source.load(ids[place]) for place in _PLACES if place < len(ids))
-    finding = first_fault(some, by_pose=by_pose)
-    if finding is None:
-        return None
-    judge = f"pcdata validate {shlex.quote(path)} judges all captures"
-    return f"{_SUBJECTS[finding.name]} wrong: {finding.found}; {finding.advice} ({judge})"
+def judge_of_all(source: object, path: str = "") -> str:
+    """Say what judges all captures of a source, to be put behind what a look at a few of them tells."""
+    place = path or str(getattr(source, "path", ""))
+    return f"({' '.join(filter(None, ['pcdata validate', place and shlex.quote(place)]))} judges all captures)"
+
+
+def first_fault(captures: Iterable[DepthFrame | PointCloud], *, by_pose: bool = True) -> Finding | None:
+    """Return the check of the unit, or else of the poses, that fails for captures in their order; None = neither."""
+    look = _Look(by_pose)
+    for capture in captures:
+        look.at(capture)
+        if look.is_done:
+            break
+    return look.concluded()
+
+
+class _Look:
+    """What the checks of the unit and of the poses find, capture after capture."""
+
+    def __init__(self, by_pose: bool) -> None:
+        self.is_done = False
+        self._by_pose = by_pose
+        self._limits = CaptureLimits()
+        self._checks: list[tuple[Check, tuple[Any, ...]]] = [(check, check.memory()) for check in _named(POSES)]
+        self._is_first = True
+        self._fault: Finding | None = None
+        self._found: list[Finding] = []
+
+    @torch_on_one_thread()
+    def at(self, capture: DepthFrame | PointCloud) -> None:
+        try:
+            self.is_done = self._judge(capture)
+        except PcdataError:
+            self.is_done = self._without_poses()
+
+    def _judge(self, capture: DepthFrame | PointCloud) -> bool:
+        """Judge a capture; say whether no other one is needed."""
+        is_first, self._is_first = self._is_first, False
+        if not isinstance(capture, DepthFrame):
+            return self._without_poses()
+        for check in _named(UNIT) if is_first else ():
+            if fault := _failed(UNIT, check.judge(capture, self._limits, (), *check.memory())):
+                self._fault = fault
+                return self._without_poses()  # of depth that is known to be wrong no pose can be told
+        if not self._by_pose or capture.world_from_camera is None:
+            return self._without_poses()
+        for check, memory in self._checks:
+            self._found += check.judge(capture, self._limits, (), *memory)
+        return capture.num_views > 1
+
+    def _without_poses(self) -> bool:
+        self._found, self._checks = [], []
+        return True
+
+    @torch_on_one_thread()
+    def concluded(self) -> Finding | None:
+        """Return the fault, once; of poses what all captures together tell is surer than what one of them does."""
+        found, checks = self._found, self._checks
+        fault, self._fault, self._found, self._checks, self.is_done = self._fault, None, [], [], True
+        try:
+            for check, memory in checks:
+                found += check.whole(*memory, self._limits) if check.whole is not None else []
+        except PcdataError:
+            return fault
+        return fault or _failed(POSES, found[::-1])
 
 
 def _named(name: str) -> list[Check]:
