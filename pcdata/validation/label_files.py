@@ -92,7 +92,8 @@ def matched_labels(predicted: LabelFile, true: LabelFile) -> tuple[Tensor, Tenso
         if predicted.size is not None or len(place) != len(true.place):
             raise ShapeError(
                 f"matched_labels: {predicted.path} has {_told(predicted)} but {true.path} has {_told(true)}; give "
-                "predictions at the pixels of the truth, or for every point of it (ClusterObjects with keep: all)"
+                "predictions at the pixels of the truth, such as label_image(cloud) or the dataset that a build wrote, "
+                "or for every point of it, in its order"
             )
         place = true.place
     if true.size is None:
@@ -123,7 +124,7 @@ def paired_files(predicted: str | os.PathLike[str], true: str | os.PathLike[str]
         raise ConfigError(f"give two files or two folders; of {first} and {second} one is a folder")
     if not first.is_dir():
         return [(second.stem, first, second)]
-    found = [_files_in(folder) for folder in (first, second)]
+    found = [files_by_name(folder) for folder in (first, second)]
     names = [set(files) for files in found]
     for one, other, folder in ((0, 1, second), (1, 0, first)):
         if alone := sorted(names[one] - names[other]):
@@ -134,7 +135,12 @@ def paired_files(predicted: str | os.PathLike[str], true: str | os.PathLike[str]
     return [(name, found[0][name], found[1][name]) for name in sorted(names[0], key=_natural)]
 
 
-def _files_in(folder: Path) -> dict[str, Path]:
+def files_by_name(folder: Path) -> dict[str, Path]:
+    """Return the label files of a folder, at any depth, by their paths in it without the suffix.
+
+    Raises:
+        CaptureError: two have the same name.
+    """
     files: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() not in IMAGES + CLOUDS or not path.is_file():
@@ -164,4 +170,4 @@ def _told(file: LabelFile) -> str:
     return f"{len(file.labels)} points" if file.size is None else f"an image of {file.size[1]}x{file.size[0]}"
 
 
-__all__ = ["LabelFile", "matched_labels", "paired_files", "read_label_file"]
+__all__ = ["LabelFile", "files_by_name", "matched_labels", "paired_files", "read_label_file"]

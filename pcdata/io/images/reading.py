@@ -209,9 +209,10 @@ def read_labels(path: str | os.PathLike[str]) -> Tensor:  # (H, W) int64
     check_suffix(where, path, (".png",))
     mode, pixels, (bits, _) = _decode(where, Path(path), (_PNG,))
     if not (mode == "P" or (mode == "L" and bits == 8) or (bits == 16 and mode.startswith("I"))):
+        is_gray = mode in ("1", "L")
         raise CaptureError(
-            f"{where}: labels must be an 8-bit, 16-bit or palette PNG of ids, but this image is {bits}-bit {mode}; "
-            "map its colors to ids first"
+            f"{where}: labels must be an 8-bit, 16-bit or palette PNG of ids, but this image is {bits}-bit "
+            f"{'gray; save its ids with 8 bits' if is_gray else f'{mode}; map its colors to ids first'}"
         )
     return torch.from_numpy(pixels.astype(np.int64))
 
