@@ -328,8 +328,8 @@ def nothing(objects: Any) -> None:
 
 
 def uncut(*arguments: Any, backend: str) -> regions.Regions:
-    """Find regions that reach over lines which are too steep."""
-    with mock.patch.object(regions, "cut_where_steep", lambda inverse, label, *_: label):
+    """Find regions that reach over jumps, and over lines which are too steep."""
+    with mock.patch.object(regions, "cut_regions", lambda inverse, label, *_: label):
         return regions.smooth_regions(*arguments, backend="torch")
 
 
@@ -342,7 +342,8 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "steps alone, no creases": {"angle_from": 3.0, "angle_full": 4.0},
     "creases alone, no steps": NEVER,
     "convex creases do not bound regions": {"convex_part": 0.0},
-    "no cuts where regions are steep": {"smooth_regions": uncut},
+    "no cuts at jumps and steep lines": {"smooth_regions": uncut},
+    "no rough seeds": {"roughest": 1.0},
     "limit 0.2": {"PARTS_FROM": 0.2},
     "limit 0.5": {"PARTS_FROM": 0.5},
 }

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pcdata.functional.touching.limits import KINECT_NOISE, Limits
-from pcdata.functional.touching.parts import cut_where_steep, jumps
+from pcdata.functional.touching.parts import cut_regions, jumps
 from pcdata.functional.touching.regions import smooth_regions
 from pcdata.functional.touching.windows import PixelCamera
 
@@ -43,11 +43,13 @@ def test_one_surface_is_one_region_however_it_leans(degrees):
     assert (label == 0).all()
 
 
-def cut(label: torch.Tensor, steep: torch.Tensor, least: int) -> list[list[int]]:
-    """Cut where parts have so many pixels, each a square metre."""
-    camera = PixelCamera(1.0, 1.0, 0.0, 0.0)
+def cut(label: torch.Tensor, steep: torch.Tensor, least: int, *, jumps_at: tuple[int, ...] = ()) -> list[list[int]]:
+    """Cut where parts have so many pixels, each a square metre; jumps lie behind some columns."""
     inverse = torch.ones(label.shape, dtype=torch.float64)
-    return cut_where_steep(inverse, label, steep, camera, Limits(seed_area=least)).tolist()
+    across, along = (label[:, 1:] < -9), (label[1:] < -9)
+    across[:, list(jumps_at)] = True
+    camera, limits = PixelCamera(1.0, 1.0, 0.0, 0.0), Limits(part_area=least)
+    return cut_regions(inverse, label, steep, across, along, camera, limits).tolist()
 
 
 def test_parts_take_the_line_between_them_and_are_numbered_by_their_first_pixels():
@@ -60,7 +62,7 @@ def test_parts_take_the_line_between_them_and_are_numbered_by_their_first_pixels
     assert cut(label, steep, 2) == [[0, 0, 0, 1, 1, -1, 2, 2]] * 2
 
 
-def test_parts_smaller_than_seeds_stay_with_their_region():
+def test_small_parts_stay_with_their_region():
     label = torch.zeros(2, 5, dtype=torch.int64)
     steep = torch.tensor([[False, True, False, False, False]] * 2)
     assert cut(label, steep, 3) == [[0] * 5] * 2
@@ -68,6 +70,9 @@ def test_parts_smaller_than_seeds_stay_with_their_region():
     assert cut(label, torch.ones_like(steep), 1) == [[0] * 5] * 2  # steep everywhere
     steep[0, 1] = False  # the line has a gap
     assert cut(label, steep, 2) == [[0] * 5] * 2
+    assert cut(label, steep, 2, jumps_at=(2,)) == [[0, 0, 0, 1, 1]] * 2
+    assert cut(label, steep, 5, jumps_at=(2,)) == [[0] * 5] * 2
+    assert cut(label, steep, 4, jumps_at=(0,)) == [[0] * 5] * 2  # one part is too small
 
 
 def test_an_image_without_a_region_or_a_pixel_has_nothing_to_cut():

@@ -52,8 +52,12 @@ class Limits(NamedTuple):
     # Only contacts look at it. Over an edge that is convex by 25 degrees a step must be twice as large: windows of few
     # pixels reach over rims and edges, and the planes fitted there miss each other.
     rim: float = chord(25)
-    # Times `smooth`: how rough seeds may be. In one image the smoothest alone: borders stay where creases are.
-    roughest: float = 1.0
+    # Times `smooth`: how rough seeds may be. The face of a box that is 3 cm wide is nowhere smooth: creases are near.
+    roughest: float = 1.5
+    # Square metres. Seeds that are rougher are larger: slivers along a rim, which a sensor smears, are rough too.
+    rough_area: float = 6.4e-4
+    # What a jump or a steep line cuts off is a region of its own from here on: twice a seed, as its border counts too.
+    part_area: float = 3.2e-4
 
 
 # Times `smooth`, up to `roughest`: a narrow can is nowhere as smooth as a box; what holds no smoother seed is one too.

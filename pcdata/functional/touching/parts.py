@@ -37,20 +37,30 @@ def parted_at_jumps(
     """Make regions of their own of what jumps part in one; parts smaller than seeds are of none."""
     across, along = jumps(inverse, inverse > 0, limits.jump * noise)
     across, along = across | (label[:, 1:] != label[:, :-1]), along | (label[1:] != label[:-1])
-    part, large = large_parts(label >= 0, across, along, inverse, camera, limits)
+    part, large = large_parts(label >= 0, across, along, inverse, camera, limits.seed_area)
     return torch.where(large, large.cumsum(0) - 1, -1)[part]
 
 
-def cut_where_steep(inverse: Tensor, label: Tensor, steep: Tensor, camera: PixelCamera, limits: Limits) -> Tensor:
-    """Cut regions in which lines that are steep part two and more parts as large as seeds.
+def cut_regions(
+    inverse: Tensor,  # (H, W) float64
+    label: Tensor,  # (H, W) int64, -1 = none
+    steep: Tensor,  # (H, W) bool
+    across: Tensor,  # the jumps
+    along: Tensor,
+    camera: PixelCamera,
+    limits: Limits,
+) -> Tensor:  # (H, W) int64, in the order of first pixels
+    """Cut regions in which jumps, and lines that are steep, part two and more large parts.
 
     The parts take what else there is of their region, one pixel at a time.
     """
     none, count = label.numel(), int(label.max()) + 1 if label.numel() else 0
     if count == 0:
         return label
-    across, along = label[:, 1:] != label[:, :-1], label[1:] != label[:-1]
-    part, large = large_parts((label >= 0) & ~steep, across, along, inverse, camera, limits)
+    border_across, border_along = label[:, 1:] != label[:, :-1], label[1:] != label[:-1]
+    part, large = large_parts(
+        (label >= 0) & ~steep, across | border_across, along | border_along, inverse, camera, limits.part_area
+    )
     is_cut = torch.bincount(label.flatten()[large.nonzero().squeeze(1)], minlength=count) > 1
     pixel = torch.arange(none, dtype=torch.int64, device=label.device)
     first = torch.full((count + 1,), none, dtype=torch.int64, device=label.device)
@@ -59,18 +69,18 @@ def cut_where_steep(inverse: Tensor, label: Tensor, steep: Tensor, camera: Pixel
     start = torch.where(is_cut[own], torch.where(large[part], part, none), first[own + 1])
     start = torch.where(label >= 0, start, none)
     seeds = torch.where(start < none, torch.searchsorted(start[start < none].unique(), start), -1)
-    return flooded(seeds, torch.zeros_like(inverse), label >= 0, across, along)
+    return flooded(seeds, torch.zeros_like(inverse), label >= 0, border_across, border_along)
 
 
 def large_parts(
-    mask: Tensor, across: Tensor, along: Tensor, inverse: Tensor, camera: PixelCamera, limits: Limits
+    mask: Tensor, across: Tensor, along: Tensor, inverse: Tensor, camera: PixelCamera, least: float
 ) -> tuple[Tensor, Tensor]:
-    """Return the connected part (H, W) of every pixel, see :func:`connected_pixels`, and which parts are large."""
+    """Return the connected part (H, W) of every pixel, see :func:`connected_pixels`, and which cover so many m2."""
     part = connected_pixels(mask, across, along)
     area = 1 / (inverse * inverse).clamp(min=1e-12) / (camera.fx * camera.fy)
     size = torch.zeros(mask.numel() + 1, dtype=torch.float64, device=mask.device)
     size.index_add_(0, part.flatten(), torch.where(mask, area, 0.0).flatten())
-    large = size >= limits.seed_area
+    large = size >= least
     large[-1] = False
     return part, large
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
 from pcdata.functional.touching.limits import CREASE_PIXELS, NORMAL_PIXELS, SMOOTH, STEEP_PIXELS, Limits
-from pcdata.functional.touching.parts import cut_where_steep, flooded, jumps, large_parts
+from pcdata.functional.touching.parts import cut_regions, flooded, jumps, large_parts
 from pcdata.functional.touching.windows import (
     PixelCamera,
     dot,
@@ -50,7 +50,8 @@ def smooth_regions(
     Planes are linear in 1/z over the image, and the noise of sensors that triangulate is the same everywhere in it, so
     all is fitted and compared there. Regions start where no crease is near and flood the rest, over jumps last: through
     ever sharper creases, one pixel at a time, the lowest of the regions that reach a pixel first. Then those are cut
-    that reach over a line which is steeper than any surface that is followed: a jump that the sensor has smeared.
+    that reach over jumps, or over a line which is steeper than any surface that is followed: a jump that the sensor has
+    smeared.
     """
     there = inverse > 0
     scale = spread(noise)
@@ -67,7 +68,7 @@ def smooth_regions(
     reach = in_pixels(limits.normal_reach * scale, camera, inverse, STEEP_PIXELS)
     planes = window_planes(inverse, there, reach, camera, noise, limits)
     steep = is_steep(planes, columns, rows, camera, limits)
-    return Regions(cut_where_steep(inverse, label, steep, camera, limits), normals)
+    return Regions(cut_regions(inverse, label, steep, across, along, camera, limits), normals)
 
 
 def _creases(
@@ -156,7 +157,8 @@ def _seeds(
         for down in (-1, 0, 1):
             for right in (-1, 0, 1):
                 inside &= shifted(smooth, down, right)
-        part, large = large_parts(inside, across, along, inverse, camera, limits)
+        least = limits.seed_area if factor == 1 else limits.rough_area
+        part, large = large_parts(inside, across, along, inverse, camera, least)
         large[part[inside & (seeds >= 0)]] = False  # holds a smoother one
         own = torch.where(large, large.cumsum(0) - 1 + number, -1)[part]
         seeds = torch.where(own >= 0, own, seeds)

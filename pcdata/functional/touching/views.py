@@ -6,6 +6,7 @@ edge contraction).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -69,8 +70,9 @@ def separate_views(
         limits: as there.
         backend: as there.
     """
-    # Regions that are too many cost little where views vote; those that hold two objects cannot be parted again.
-    limits = limits or Limits(roughest=2.0, seed_area=0.8e-4)
+    # Regions that are too many cost little where views vote; those that hold two objects cannot be parted again. What
+    # jumps part is parted below, without what is small.
+    limits = limits or Limits(roughest=2.0, seed_area=0.8e-4, rough_area=0.8e-4, part_area=math.inf)
     region = torch.full((len(points),), -1, dtype=torch.int64, device=points.device)
     view_of_row = torch.full_like(region, -1)
     evidence = _Evidence()

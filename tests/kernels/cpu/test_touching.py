@@ -39,7 +39,7 @@ CAMERA = PixelCamera(260.0, 250.0, 33.0, 20.0)
 @pytest.mark.parametrize(("seed", "roughest"), [(1, 1.0), (2, 1.5), (3, 2.0)])
 def test_regions_and_contacts_equal_the_reference(seed, noise, roughest):
     inverse = heap(seed, noise)
-    limits = Limits(seed_area=4e-5, roughest=roughest)
+    limits = Limits(seed_area=4e-5, roughest=roughest, rough_area=6e-5, part_area=8e-5)
     own = smooth_regions(inverse, CAMERA, noise, limits, backend="cpu")
     expected = smooth_regions(inverse, CAMERA, noise, limits, backend="torch")
     assert int(expected.label.max()) > 0  # several regions
@@ -60,7 +60,7 @@ def test_regions_are_cut_over_smeared_steps_as_in_the_reference(length):
     rows, columns = rays(inverse.shape, CAMERA, inverse.device)
     assert 0 < int(is_steep(planes, columns, rows, CAMERA, Limits()).sum()) < inverse.numel()
     own, expected = (
-        smooth_regions(inverse, CAMERA, KINECT_NOISE, Limits(seed_area=4e-5), backend=backend).label
+        smooth_regions(inverse, CAMERA, KINECT_NOISE, Limits(seed_area=4e-5, part_area=8e-5), backend=backend).label
         for backend in ("cpu", "torch")
     )
     assert int(expected.max()) > 1
@@ -79,6 +79,7 @@ def test_an_image_of_one_pixel_and_one_without_readings_have_no_region():
 def test_what_is_too_rough_for_the_first_seeds_becomes_one_where_rough_ones_are_asked_for():
     inverse = heap(1, KINECT_NOISE)
     few, many = (
-        smooth_regions(inverse, CAMERA, KINECT_NOISE, Limits(seed_area=4e-5, roughest=one)) for one in (1.0, 2.0)
+        smooth_regions(inverse, CAMERA, KINECT_NOISE, Limits(seed_area=4e-5, roughest=one, rough_area=4e-5))
+        for one in (1.0, 2.0)
     )
     assert int(many.label.max()) > int(few.label.max())

@@ -16,7 +16,7 @@ namespace {
 // As pcdata.functional.touching.limits lays them out.
 struct Limits {
   double normal_reach, crease_reach, contact_reach, jump, gate, step, slope, full_crease, convex_part, smooth;
-  double angle_from, angle_full, gap_from, gap_full, seed_area, rim, roughest;
+  double angle_from, angle_full, gap_from, gap_full, seed_area, rim, roughest, rough_area, part_area;
 };
 struct Camera {
   double fx, fy, cx, cy;
@@ -313,6 +313,7 @@ class Flood {
     for (const double factor : kSmooth) {
       if (factor > image_.limits->roughest) break;
       const double limit = image_.limits->smooth * factor;
+      const double least = factor == 1 ? image_.limits->seed_area : image_.limits->rough_area;
       for (int64_t p = 0; p < size; ++p) {
         const int64_t row = p / width, c = p % width;
         smooth[p] = image_.there(p) && crease[p] < limit && !across_[p] && !along_[p] && !(c > 0 && across_[p - 1]) &&
@@ -345,7 +346,7 @@ class Flood {
         if (!inside[static_cast<size_t>(p)]) continue;
         const int64_t root = parts.find(static_cast<uint32_t>(p));
         int64_t& own = of[static_cast<size_t>(root)];
-        if (own == -2 || !(area[root] >= image_.limits->seed_area)) continue;
+        if (own == -2 || !(area[root] >= least)) continue;
         if (own < 0) own = number++;
         label_[p] = own;
       }
@@ -406,32 +407,30 @@ class Flood {
   bool over_all_ = false;
 };
 
-// Cut regions in which lines that are steep part two and more parts as large as seeds; the parts take what else there
-// is of their region. Regions are numbered by their first pixels.
-void cut_where_steep(const Image& image, const uint8_t* steep, int64_t* label, std::atomic<uint32_t>* parents,
-                     double* area, uint8_t* across, uint8_t* along, Poll& poll) {
+// Cut regions in which jumps, and lines that are steep, part two and more large parts; the parts take what else there
+// is of their region. Regions are numbered by their first pixels. The jumps become the borders of regions.
+void cut_regions(const Image& image, const uint8_t* steep, int64_t* label, std::atomic<uint32_t>* parents, double* area,
+                 uint8_t* across, uint8_t* along, Poll& poll) {
   const int64_t width = image.width, size = image.size();
   const double pixels = image.camera.fx * image.camera.fy;
   cells::UnionFind parts(parents, size);
+  const auto flat = [&](int64_t p) { return label[p] >= 0 && !steep[p]; };
+  const auto connect = [&](int64_t p, int64_t q, uint8_t& closed) {
+    if (label[p] == label[q] && !closed && flat(p) && flat(q))
+      parts.join(static_cast<uint32_t>(p), static_cast<uint32_t>(q));
+    closed = label[p] != label[q];
+  };
   int64_t count = 0;
   for (int64_t p = 0; p < size; ++p) {
-    across[p] = p % width + 1 < width && label[p] != label[p + 1];
-    along[p] = p + width < size && label[p] != label[p + width];
+    if (p % width + 1 < width) connect(p, p + 1, across[p]);
+    if (p + width < size) connect(p, p + width, along[p]);
     count = std::max(count, label[p] + 1);
-  }
-  const auto flat = [&](int64_t p) { return label[p] >= 0 && !steep[p]; };
-  for (int64_t p = 0; p < size; ++p) {
-    if (!flat(p)) continue;
-    if (p % width > 0 && !across[p - 1] && flat(p - 1))
-      parts.join(static_cast<uint32_t>(p), static_cast<uint32_t>(p - 1));
-    if (p >= width && !along[p - width] && flat(p - width))
-      parts.join(static_cast<uint32_t>(p), static_cast<uint32_t>(p - width));
   }
   std::fill_n(area, size, 0.0);
   for (int64_t p = 0; p < size; ++p)
     if (flat(p))
       area[parts.find(static_cast<uint32_t>(p))] += 1 / std::max(image.inverse[p] * image.inverse[p], 1e-12) / pixels;
-  const auto is_large = [&](int64_t root) { return area[root] >= image.limits->seed_area; };
+  const auto is_large = [&](int64_t root) { return area[root] >= image.limits->part_area; };
   std::vector<int64_t> large(static_cast<size_t>(count), 0), whole(static_cast<size_t>(count), -1);
   for (int64_t p = 0; p < size; ++p)
     if (flat(p) && parts.find(static_cast<uint32_t>(p)) == p && is_large(p)) ++large[static_cast<size_t>(label[p])];
@@ -486,7 +485,7 @@ PC_EXPORT int32_t pc_smooth_regions(const pc_context* context, const double* inv
     flood.seeds(crease, marks, parents, sums);
     for (const bool over_jumps : {false, true}) flood.run(poll, over_jumps);
     mark_steep(*context, image, marks);
-    cut_where_steep(image, marks, label, parents, sums, across, along, poll);
+    cut_regions(image, marks, label, parents, sums, across, along, poll);
   });
 }
 
