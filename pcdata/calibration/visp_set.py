@@ -60,7 +60,7 @@ def read_visp_set(folder: Path) -> HandEyeSet:
         for file_of_target in filter(Path.is_file, saved):
             target[number] = _pose(file_of_target)
         images[number] = _image(folder, files, match["start"], match["number"])
-    camera_for, camera_said = _camera(folder, [file for file in files if file.suffix.lower() == ".xml"])
+    camera_for, camera_said = _camera([file for file in files if file.suffix.lower() == ".xml"])
     board, board_said = _board([file for file in files if file.suffix.lower() == ".txt"])
     return HandEyeSet(VISP, robot, target, images, camera_for, camera_said, board, board_said)
 
@@ -110,7 +110,7 @@ class _Model(NamedTuple):
     values: tuple[float, float, float, float, float]  # fx fy cx cy, k1
 
 
-def _camera(folder: Path, files: list[Path]) -> tuple[Any, str]:
+def _camera(files: list[Path]) -> tuple[Any, str]:
     described = {file: _models(file) for file in files}
     files = [file for file, models in described.items() if models]
     if len(files) != 1:

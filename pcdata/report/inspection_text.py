@@ -11,9 +11,7 @@ from typing import Any
 
 from pcdata.datasets import CachedCloudDataset, Splits
 from pcdata.files.sample_names import counted
-from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.io.writers.writers import WRITERS
-from pcdata.report.capture_facts import capture_facts
 from pcdata.report.plain_table import text_table
 from pcdata.report.split_text import splits_in_words
 from pcdata.structures import PointCloud
@@ -67,18 +65,13 @@ def left_out_texts(skipped: Mapping[str, str], quarantined: Mapping[str, str]) -
     return parts + ([skipped_text(quarantined, how="failed twice, now quarantined")] if quarantined else [])
 
 
-def capture_text(source: CaptureSource, words: Sequence[str] = ()) -> str:
-    """Tell what a source holds; loads its first and its last capture.
+def facts_text(facts: Mapping[str, Any], words: Sequence[str] = ()) -> str:
+    """Tell what :func:`~pcdata.report.capture_facts.capture_facts` found in a source.
 
     Args:
-        source: the captures.
-        words: of the command line that opens them: path and options; then the commands to go on are told.
+        facts: of the source.
+        words: of the command line that opens it: path and options; then the commands to go on are told.
     """
-    return facts_text(capture_facts(source), words)
-
-
-def facts_text(facts: Mapping[str, Any], words: Sequence[str] = ()) -> str:
-    """Tell what :func:`capture_facts` found; see :func:`capture_text`."""
     names = ", ".join(facts["ids"]) + (", ..." if facts["captures"] > len(facts["ids"]) else "")
     size = "" if facts["bytes"] is None else f", {size_in_words(facts['bytes'])}"
     rows = [

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pcdata.contracts.numbers import require_length
+from pcdata.contracts.numbers import checked_positive
 from pcdata.errors import ConfigError, DTypeError, ShapeError
 
 FOUND_ABOVE = 0.75  # an object counts as found where its F is higher
@@ -95,11 +95,11 @@ def score_segmentation(
 
     Raises:
         ShapeError: the shapes differ, or are neither (H, W) nor (N,).
-        DTypeError: labels are no integers, or ``ignore`` is not bool.
-        ConfigError: the tolerance is not positive.
+        DTypeError: labels are no integers, ``ignore`` is not bool, or the tolerance is no number.
+        ConfigError: the tolerance is not finite and above 0.
     """
     _check(predicted, true, ignore)
-    require_length("score_segmentation", "tolerance", tolerance)
+    tolerance = checked_positive("score_segmentation", "tolerance", {"tolerance": tolerance})
     guess, truth = (labels.detach().cpu().numpy().astype(np.int64) for labels in (predicted, true))
     if ignore is not None:
         blank = ignore.detach().cpu().numpy()

@@ -12,7 +12,8 @@ from pcdata.build import build_dataset, config_from_yaml
 from pcdata.datasets import COLLATES, CachedCloudDataset, CloudDataset
 from pcdata.io.store.stores import STORES
 from pcdata.models import check, preset
-from pcdata.report.inspection_text import capture_text, dataset_text
+from pcdata.report.capture_facts import capture_facts
+from pcdata.report.inspection_text import dataset_text, facts_text
 from pcdata.structures import DepthFrame, PointCloud, Signal
 from pcdata.synthetic import SyntheticSource
 from tests.factories import assert_same, cloud_in_base
@@ -58,7 +59,7 @@ def test_a_built_dataset_keeps_the_bits_that_the_capture_had(robot, form, tmp_pa
 
 
 def test_a_capture_is_told_with_its_signals(robot):
-    assert "joints: invariant, (7,) float32" in capture_text(robot)
+    assert "joints: invariant, (7,) float32" in facts_text(capture_facts(robot))
 
 
 @pytest.mark.parametrize("name", list(COLLATES))

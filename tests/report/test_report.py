@@ -17,7 +17,8 @@ from pcdata.io import open_source, write_ply
 from pcdata.io.sources.source import Source
 from pcdata.report import save_pipeline_figure, text_table
 from pcdata.report.build_text import build_text
-from pcdata.report.inspection_text import capture_text
+from pcdata.report.capture_facts import capture_facts
+from pcdata.report.inspection_text import facts_text
 from pcdata.synthetic import tabletop
 
 needs_matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="matplotlib is absent")
@@ -58,7 +59,7 @@ def test_build_text_of_a_pipeline_without_steps_is_still_a_report():
 def test_capture_text_of_a_cloud_file_tells_its_extent(tmp_path):
     points = torch.tensor([[0.0, -1.0, 0.5], [2.0, 1.0, 0.25]])
     write_ply(tmp_path / "one.ply", PointCloud(points=points, frame_id="camera"))
-    text = capture_text(open_source(tmp_path))
+    text = facts_text(capture_facts(open_source(tmp_path)))
     for part in ("clouds", "one", "x 0.000 to 2.000", "y -1.000 to 1.000", "z 0.250 to 0.500"):
         assert part in text
 
@@ -84,8 +85,8 @@ class _Source(Source):
 def test_captures_with_nothing_in_them_are_described_too():
     camera = Camera.pinhole(fx=9.0, fy=9.0, cx=4.0, cy=3.0, size=(6, 8))
     blank = DepthFrame(depth=torch.zeros(1, 6, 8), camera=camera)
-    assert "0 of 48 pixels valid" in capture_text(_Source(blank))
-    assert "empty" in capture_text(_Source(PointCloud(points=torch.zeros(0, 3), frame_id="camera")))
+    assert "0 of 48 pixels valid" in facts_text(capture_facts(_Source(blank)))
+    assert "empty" in facts_text(capture_facts(_Source(PointCloud(points=torch.zeros(0, 3), frame_id="camera"))))
 
 
 @needs_matplotlib

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 
 import pytest
 import torch
@@ -83,6 +84,21 @@ def test_the_tolerance_is_a_part_of_the_diagonal_in_whole_pixels():
     for shift, matched in ((3, True), (4, False)):  # 0.003 * 800 = 2.4, rounded up
         moved = image(480, 640, _0=(slice(100, 200), slice(100 + shift, 200 + shift)))
         assert (score_segmentation(moved, true).boundary_f == 1.0) is matched
+
+
+@pytest.mark.parametrize(
+    ("tolerance", "error"),
+    [
+        *((number, ConfigError) for number in (0, 0.0, -0.003, math.nan, math.inf)),
+        *((other, DTypeError) for other in ("0.003", True, None, [3])),
+    ],
+)
+def test_a_tolerance_that_is_no_share_of_the_diagonal_and_no_pixels_is_refused(tolerance, error):
+    true = image(10, 10, _0=(slice(0, 5), slice(0, 10)))
+    with pytest.raises(error, match="score_segmentation: tolerance must be") as caught:
+        score_segmentation(true, true, tolerance=tolerance)
+    assert "points" not in str(caught.value), "it is no length of a cloud"
+    assert score_segmentation(true, true, tolerance=1e-18).boundary_f == 1.0
 
 
 def test_what_has_no_truth_is_not_scored():

@@ -46,17 +46,6 @@ def z_of_rendered(where: str, values: Tensor, kind: DepthValues, near: float, fa
     return torch.where(share < _FAR, z, 0.0).float()
 
 
-def rendered_of_z(depth: Tensor, kind: DepthValues, near: float, far: float) -> Tensor:
-    """Return float64 shares of the range of depth in metres, the other way; no reading becomes the far plane.
-
-    Raises:
-        CaptureError: near and far are not 0 < near < far.
-    """
-    check_planes("rendered_of_z", near, far)
-    z = torch.where(depth > 0, depth.double(), far).clamp(near, far)
-    return (1 - near / z) / (1 - near / far) if kind == "z_buffer" else (z - near) / (far - near)
-
-
 def ray_lengths(size: tuple[int, int], intrinsics: Tensor, distortion: Tensor | None) -> Tensor:  # (V, H, W) float64
     """Return for every pixel how long the ray is that reaches z = 1: lengths along rays divided by it are z.
 

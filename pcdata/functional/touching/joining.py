@@ -49,7 +49,6 @@ class Objects:
         first, second, strength = (one.cpu() for one in scene.contacts)
         flat = scene.label.flatten().cpu()
         a, b = flat[first], flat[second]
-        self._contact: dict[tuple[int, int], list[int]] = {}
         code = torch.minimum(a, b) * max(scene.num_regions, 1) + torch.maximum(a, b)
         order = torch.argsort(code, stable=True)
         ids, counts = torch.unique_consecutive(code[order], return_counts=True)

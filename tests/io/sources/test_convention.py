@@ -12,7 +12,7 @@ import torch
 
 from pcdata import DepthFrame, open_source
 from pcdata.errors import CaptureError, ConfigError, DTypeError
-from pcdata.functional.depth.rendered import ray_lengths, rendered_of_z, z_of_rendered
+from pcdata.functional.depth.rendered import ray_lengths, z_of_rendered
 from pcdata.geometry.camera_axes import CAMERA_AXES
 from pcdata.geometry.rigid import invert_rigid
 from pcdata.synthetic import SyntheticSource
@@ -75,6 +75,12 @@ def test_axes_are_turns_that_lead_to_what_their_words_say() -> None:
             letter, direction = told.split()
             assert letter == "xyz"[axis]
             assert seen[direction].tolist() == np.eye(3)[axis].tolist()
+
+
+def rendered_of_z(depth: torch.Tensor, kind: str, near: float, far: float) -> torch.Tensor:
+    """What a renderer stores of depth: shares of the range, the far plane where nothing is."""
+    z = torch.where(depth > 0, depth.double(), far).clamp(near, far)
+    return (1 - near / z) / (1 - near / far) if kind == "z_buffer" else (z - near) / (far - near)
 
 
 @pytest.mark.parametrize("kind", ["ray", "z_buffer", "equal_steps"])
