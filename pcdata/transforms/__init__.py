@@ -10,15 +10,9 @@ from pcdata.transforms.deproject import Deproject, MaskDepth
 from pcdata.transforms.depth_filters import FillHoles, RemoveFlyingPixels, SpatialFilterDepth
 from pcdata.transforms.depth_inpainting import InpaintDepth
 from pcdata.transforms.depth_sizes import CropCenter, DecimateDepth, RandomTurnDepth, ResizeDepth, TurnDepth
-from pcdata.transforms.downsample import (
-    FarthestPointSample,
-    RandomFarthestPointSample,
-    RandomPointCount,
-    RandomSample,
-    RandomShuffle,
-    VoxelDownsample,
-)
+from pcdata.transforms.downsample import VoxelDownsample
 from pcdata.transforms.families import LeftOutWarning, RemoveTransform, SelectTransform, SpatialTransform
+from pcdata.transforms.farthest_samples import FarthestPointSample, RandomFarthestPointSample
 from pcdata.transforms.found_planes import plane_hulls_in_cloud, planes_in_cloud
 from pcdata.transforms.frames import MergeViews, ToFrame
 from pcdata.transforms.fusion import FuseTSDF
@@ -44,6 +38,7 @@ from pcdata.transforms.random_motions import (
     RandomTranslation,
 )
 from pcdata.transforms.random_parts import RandomCuboid, RandomOcclusion
+from pcdata.transforms.random_samples import RandomPointCount, RandomSample, RandomShuffle
 from pcdata.transforms.selection import DropNonFinite, KeepValues, RemoveDuplicates
 from pcdata.transforms.sensor_noise import RandomSensorNoise
 from pcdata.transforms.shape import DescribeShape
