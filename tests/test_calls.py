@@ -16,7 +16,7 @@ LIMITS = {  # calls, files; counted with Python before 3.12, where comprehension
     # of eight steps in five passes; checksums have a file of their own; a plane takes as many rounds as it needs;
     # kernels of outliers and of normals have one each, and so have what both ask of the core, how passes are run, and
     # what all samplers do alike
-    "live": (553, 50),
+    "live": (553, 51),  # answering a frame and running the steps have a file each
     "build": (
         3500,
         127,  # the options have a file of their own, and so do numbers in words, what the core finds of planes, motions

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping
 from os import PathLike
 from pathlib import Path
 from threading import Lock
@@ -17,7 +17,6 @@ from torch import Tensor
 from pcdata.build import load_config
 from pcdata.errors import (
     CaptureError,
-    ConfigError,
     DTypeError,
     FrameError,
     IntrinsicsError,
@@ -27,9 +26,9 @@ from pcdata.errors import (
 )
 from pcdata.functional.depth.looks import look_at_depth
 from pcdata.live.arrays import ArrayReader
+from pcdata.live.chain_runs import ChainRuns
 from pcdata.live.faults import Fault, LiveResult, StalledError
 from pcdata.live.first_frame import check_like, has_readings
-from pcdata.live.fixed_frames import FixedFrames, Seen
 from pcdata.live.kept_memory import keep_freed_memory
 from pcdata.live.latency import Histogram
 from pcdata.live.latest_frame import LatestFrame
@@ -40,7 +39,6 @@ from pcdata.structures import DepthFrame, PointCloud
 from pcdata.structures.structure import with_tensors
 from pcdata.threads import torch_on_one_thread
 from pcdata.transforms import Compose
-from pcdata.transforms.found_planes import guessing_planes
 
 _KINDS: tuple[tuple[type[Exception], Fault], ...] = (  # of what making a frame raises; the first that fits
     (IntrinsicsError, Fault.OTHER_CAMERA),
@@ -97,7 +95,6 @@ class LivePipeline:
         seed: int | None = None,
     ) -> None:
         self.chain = _chain_of(chain)
-        self._check_chain(seed)
         if not isinstance(like, DepthFrame):
             raise DTypeError(
                 f"LivePipeline: like must be a DepthFrame, got {type(like).__name__}; of arrays make one by "
@@ -109,37 +106,17 @@ class LivePipeline:
             )
         keep_freed_memory()
         self.before, self.max_age = before, max_age
-        self._like, self._seed, self._same_pixels = like, seed, same_pixels
-        self._warm_planes = warm_planes
-        self._planes: Sequence[Mapping[str, Any]] = ()  # of the last cloud
+        self._like, self._same_pixels = like, same_pixels
         self._arrays = ArrayReader(like, like.provenance.get("metres_per_unit"), invalid_values)
         self._stamps = Stamps(max_age, clock)
         self._camera: LatestFrame | None = None
         self._last: Tensor | None = None
         self._copies: list[Tensor] = []  # two at most, used in turns
         self._turn = Lock()  # held while a frame is worked on
-        self._names = [type(step).__name__ for step in self.chain.steps]
-        self._pass_names: dict[tuple[int, int], str] = {}
         self._number = 0
-        self._fixed: FixedFrames | None = None
+        self._runs = ChainRuns(self.chain, like, seed=seed, warm_planes=warm_planes)
+        self._looks_first = before is None and bool(self._runs.captured)  # a filter comes before all steps
         self.reset_stats()
-        if self._run(like) is None:
-            raise ConfigError("LivePipeline: the chain gives no clouds; put Deproject into it")
-        self._fixed = FixedFrames.of(list(self.chain.steps), like)
-        self._rest = self.chain.steps_from(0 if self._fixed is None else len(self._fixed.steps))
-        self.reset_stats()
-
-    def _check_chain(self, seed: int | None) -> None:
-        if not issubclass(self.chain.takes, DepthFrame) or not issubclass(self.chain.gives, PointCloud):
-            raise ConfigError(
-                f"LivePipeline: the chain must lead from captures to clouds, but takes a {self.chain.takes.__name__} "
-                f"and gives a {self.chain.gives.__name__}; Deproject makes one of the other"
-            )
-        if self.chain.is_random and seed is None:
-            raise ConfigError(
-                "LivePipeline: the chain has random steps, which are for training; give chain.split()[0], the steps "
-                "before the first of them, or a seed to draw with for every frame"
-            )
 
     def __call__(
         self,
@@ -191,7 +168,7 @@ class LivePipeline:
                 frame = given
             else:
                 frame = self._arrays.frame(given, colors, confidence, pose, keep=self._last)
-            seen = None if self._fixed is None else self._looked_at(frame)
+            seen = self._runs.look(frame) if self._looks_first else None
             # Nobody else writes to depth that was made of an array.
             copy = self._room_for_copy(frame.depth) if self._same_pixels and seen is None and frame is given else None
             looked = seen or look_at_depth(frame.depth, self._last if self._same_pixels else None, copy)
@@ -209,8 +186,8 @@ class LivePipeline:
             if self.before is not None:
                 since = time.perf_counter()
                 frame = self.before(frame, stamp)
-                self._count(type(self.before).__name__, time.perf_counter() - since)
-            cloud = self._run(frame, seen)
+                self._runs.count(type(self.before).__name__, time.perf_counter() - since)
+            cloud = self._runs.run(frame, seen)
         except NonFiniteError as error:
             return None, Fault.BAD_VALUES, str(error)
         except Exception as error:
@@ -227,53 +204,6 @@ class LivePipeline:
                 return room
         self._copies.append(torch.empty_like(depth, memory_format=torch.contiguous_format, requires_grad=False))
         return self._copies[-1]
-
-    def _looked_at(self, frame: DepthFrame) -> Seen | None:
-        """Run the captured steps on a frame; None where there are none, or a filter comes before them."""
-        if self._fixed is None or self.before is not None:
-            return None
-        self._since = time.perf_counter()
-        return self._fixed.look(frame)
-
-    def _run(self, frame: DepthFrame, seen: Seen | None = None) -> PointCloud:
-        """Run the chain, behind what was captured, and count how long each pass took."""
-        seed = self._seed
-        generator = None if seed is None else torch.Generator("cpu").manual_seed(seed)
-        chain, done, since = self.chain, 0, time.perf_counter()
-        data: DepthFrame | PointCloud = frame
-
-        def after(steps: range, _: Any) -> None:
-            nonlocal since
-            now = time.perf_counter()
-            self._count(self._pass_name(done + steps.start, done + steps.stop), now - since)
-            since = now
-
-        with torch.set_grad_enabled(False), guessing_planes(self._planes):
-            if self._fixed is not None:
-                if seen is None:
-                    self._since = since
-                    seen = self._fixed.look(frame)
-                begun = None if seen is None else self._fixed.cloud(frame, seen)
-                if begun is not None:
-                    chain, data, since = self._rest, begun, self._since
-                    after(range(len(self._fixed.steps)), data)
-                    done = len(self._fixed.steps)
-            cloud: PointCloud = chain.run_in_passes(data, generator=generator, after=after)
-        if self._warm_planes and "RemovePlane" not in self.captured:  # which searches anew, and tells later
-            self._planes = cloud.meta[0].get("planes", ())
-        return cloud
-
-    def _pass_name(self, start: int, stop: int) -> str:
-        name = self._pass_names.get((start, stop))
-        if name is None:
-            name = self._pass_names[start, stop] = " + ".join(self._names[start:stop])
-        return name
-
-    def _count(self, name: str, seconds: float) -> None:
-        taken = self._passes.get(name)
-        if taken is None:
-            taken = self._passes[name] = Histogram()
-        taken.add(seconds)
 
     def follow(self, camera: LatestFrame) -> Iterator[LiveResult]:
         """Answer the newest frame of a camera, again and again, until it ends the stream.
@@ -305,23 +235,21 @@ class LivePipeline:
         """Forget the frames before: their stamps, their pixels, what filters gathered. The counts stay."""
         with self._turn:
             self._stamps.reset()
-            self._last, self._planes = None, ()
-            if self._fixed is not None:
-                self._fixed.forget()
+            self._last = None
+            self._runs.forget()
             if self.before is not None:
                 self.before.reset()
 
     def reset_stats(self) -> None:
         """Begin to count anew."""
         self._whole = Histogram()
-        self._passes: dict[str, Histogram] = {}
+        self._runs.reset_stats()
         self._faults: Counter[str] = Counter()
         self._counted_from = self._number
         self._dropped_before = 0 if self._camera is None else self._camera.dropped
 
     def stats(self) -> LiveStats:
         """Return what was counted since the start, or since :meth:`reset_stats`."""
-        passes = {name: histogram.summary() for name, histogram in self._passes.items()}
         whole = self._whole.summary()
         return LiveStats(
             captured=self.captured,
@@ -331,13 +259,13 @@ class LivePipeline:
             dropped=0 if self._camera is None else self._camera.dropped - self._dropped_before,
             restarts=self._stamps.restarts,
             resets=0 if self.before is None else self.before.resets,
-            latency={"whole": whole, **passes},
+            latency={"whole": whole, **self._runs.latency()},
         )
 
     @property
     def captured(self) -> tuple[str, ...]:
         """The steps from the first on that a GPU repeats for each frame as one CUDA graph; those behind run as ever."""
-        return () if self._fixed is None else tuple(self._names[: len(self._fixed.steps)])
+        return self._runs.captured
 
     def histogram(self) -> dict[str, list[float]]:
         """Return the latencies of whole frames: ``seconds``, the upper ends of the bins, and ``count`` of each."""
@@ -345,7 +273,7 @@ class LivePipeline:
 
     def __repr__(self) -> str:
         height, width = self._like.size
-        return f"LivePipeline({len(self._names)} steps, {self._like.num_views} views of {width}x{height})"
+        return f"LivePipeline({len(self._runs)} steps, {self._like.num_views} views of {width}x{height})"
 
 
 def _chain_of(given: Any) -> Compose:

@@ -120,8 +120,8 @@ def test_a_pipeline_follows_a_camera_through_a_stall(scene):
 
 def test_a_slow_pipeline_drops_and_never_goes_back(scene, monkeypatch):
     live = LivePipeline(pcdata.Compose([pcdata.Deproject()]), like=scene)
-    run = live._run
-    monkeypatch.setattr(live, "_run", lambda *given: (time.sleep(0.03), run(*given))[1])
+    run = live._runs.run
+    monkeypatch.setattr(live._runs, "run", lambda *given: (time.sleep(0.03), run(*given))[1])
     numbers = itertools.count()
 
     def read():

@@ -243,7 +243,7 @@ def test_a_warm_start_is_checked_and_not_trusted(scene):
         assert np.dot(plane["normal"], expected["normal"]) > 0.999
         assert plane["num_inliers"] > 0.98 * expected["num_inliers"]
     for wrong in (([0.0, 0.0, 1.0], -9.0), ([1.0, 0.0, 0.0], 0.0), ([0.0, 0.0, 0.0], 0.0)):
-        live._planes = [{"normal": wrong[0], "offset": wrong[1], "frame": "camera"}]
+        live._runs._planes = [{"normal": wrong[0], "offset": wrong[1], "frame": "camera"}]
         assert_equal(live(moved(scene, 5)).cloud, cold(moved(scene, 5)))
         live.reset()
 
