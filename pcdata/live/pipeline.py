@@ -115,7 +115,7 @@ class LivePipeline:
         self._turn = Lock()  # held while a frame is worked on
         self._number = 0
         self._runs = ChainRuns(self.chain, like, seed=seed, warm_planes=warm_planes)
-        self._looks_first = before is None and bool(self._runs.captured)  # a filter comes before all steps
+        self._is_captured = bool(self._runs.captured)
         self.reset_stats()
 
     def __call__(
@@ -168,7 +168,7 @@ class LivePipeline:
                 frame = given
             else:
                 frame = self._arrays.frame(given, colors, confidence, pose, keep=self._last)
-            seen = self._runs.look(frame) if self._looks_first else None
+            seen = self._runs.look(frame) if self._is_captured and self.before is None else None
             # Nobody else writes to depth that was made of an array.
             copy = self._room_for_copy(frame.depth) if self._same_pixels and seen is None and frame is given else None
             looked = seen or look_at_depth(frame.depth, self._last if self._same_pixels else None, copy)

@@ -7,12 +7,14 @@ every quaternion has the sign that is nearest to the one before.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from pcdata.errors import ConfigError, ShapeError, near_matches
 from pcdata.geometry.rotations import nearest_sign
-from pcdata.structures.pose_layouts import LAYOUTS
+from pcdata.structures.pose_layouts import LAYOUTS, PoseLayout
 from pcdata.structures.signal_kinds import columns_of, parse_kind
 
 USUAL_ROW = "xyz_rot6d_rows"  # the numbers of R never jump, as those of angles may
@@ -75,9 +77,9 @@ def continued(kind: str, values: Tensor, before: Tensor) -> Tensor:
     """
     parts, columns = parse_kind(kind).parts, []
     for part, own, former in zip(parts, columns_of(values, parts), columns_of(before.to(values), parts)):
-        if part.name == "pose" and part.layout is not None and part.layout.is_quaternion:
-            position, turn = part.layout.parts(own)
-            own = part.layout.joined(own, position, nearest_sign(turn, part.layout.parts(former)[1]))
+        if (layout := _of_quaternion(part)) is not None:
+            position, turn = layout.parts(own)
+            own = layout.joined(own, position, nearest_sign(turn, layout.parts(former)[1]))
         columns.append(own)
     return columns[0] if len(columns) == 1 else torch.cat(columns, dim=-1)
 
@@ -89,14 +91,27 @@ def continued_along(kind: str, values: Tensor, axis: int) -> Tensor:
         ShapeError: there are such, and no such axis.
     """
     parts = parse_kind(kind).parts
-    if not any(part.name == "pose" and part.layout is not None and part.layout.is_quaternion for part in parts):
+    if not any(map(_of_quaternion, parts)):
         return values
     if isinstance(axis, bool) or not isinstance(axis, int) or not 0 <= axis < values.ndim - 1:
         raise ShapeError(
             f"along must be an axis on which poses follow each other, 0 to {values.ndim - 2} of {tuple(values.shape)}, "
             f"got {axis!r:.100}"
         )
-    steps = list(values.unbind(axis))
-    for number in range(1, len(steps)):
-        steps[number] = continued(kind, steps[number], steps[number - 1])
-    return torch.stack(steps, dim=axis) if steps else values
+    columns = []
+    for part, own in zip(parts, columns_of(values, parts)):
+        if (layout := _of_quaternion(part)) is not None:
+            position, turn = layout.parts(own)
+            steps = turn.movedim(axis, 0)
+            # Where one turns away from the one before, it and all that follow change their sign once more.
+            flips = torch.where((steps[1:] * steps[:-1]).sum(-1, keepdim=True) < 0, -1, 1).cumprod(0)
+            turned = torch.cat([steps[:1], flips.to(steps.dtype) * steps[1:]]).movedim(0, axis)
+            own = layout.joined(own, position, turned)
+        columns.append(own)
+    return columns[0] if len(columns) == 1 else torch.cat(columns, dim=-1)
+
+
+def _of_quaternion(part: Any) -> PoseLayout | None:
+    """Return the layout of a part whose rotations have two signs, else None."""
+    layout: PoseLayout | None = part.layout if part.name == "pose" else None
+    return layout if layout is not None and layout.is_quaternion else None

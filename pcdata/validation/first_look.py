@@ -6,7 +6,6 @@ import shlex
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from pcdata.errors import PcdataError
 from pcdata.structures import DepthFrame, PointCloud
 from pcdata.threads import torch_on_one_thread
 from pcdata.validation import checks as _checks  # noqa: F401  # registers them
@@ -85,7 +84,7 @@ class _Look:
     def at(self, capture: DepthFrame | PointCloud) -> None:
         try:
             self.is_done = self._judge(capture)
-        except PcdataError:
+        except Exception:  # of whatever kind: a look must not stop those who read the captures
             self.is_done = self._without_poses()
 
     def _judge(self, capture: DepthFrame | PointCloud) -> bool:
@@ -115,7 +114,7 @@ class _Look:
         try:
             for check, memory in checks:
                 found += check.whole(*memory, self._limits) if check.whole is not None else []
-        except PcdataError:
+        except Exception:
             return fault
         return fault or _failed(POSES, found[::-1])
 

@@ -25,6 +25,7 @@ from pcdata.io.store.cloud_record import (
 from pcdata.io.store.shards import SIGNALS_KEY
 from pcdata.io.store.stores import STORES
 from pcdata.structures.pose_layouts import LAYOUTS
+from pcdata.structures.pose_rows import continued
 from pcdata.structures.signal_kinds import SIGNAL_KINDS, parse_kind, poses_of_signal, signal_kinds_table
 from pcdata.transforms import RandomRotation
 from tests.factories import assert_same, base_from_camera, cloud_in_base, cloud_in_camera
@@ -567,6 +568,11 @@ def test_quaternions_of_a_trajectory_do_not_jump_and_those_of_single_poses_have_
     assert largest_step(episode.values) < 0.05  # half the angle of a step
     torch.testing.assert_close(poses_of_signal(episode.kind, episode.values), matrix, rtol=0, atol=1e-12)
     assert torch.equal(episode.values[0], one_by_one[0])
+    one_after_another = [one_by_one[:1]]
+    for number in range(1, len(matrix)):
+        row = one_by_one[number : number + 1]
+        one_after_another.append(continued(episode.kind, row, one_after_another[-1]))
+    assert torch.equal(torch.cat(one_after_another), episode.values)
     # Of a horizon every cloud has a trajectory of its own; what jumped before goes on, what did not keeps its bits.
     horizons = torch.stack([matrix, matrix.flip(0)])
     written = Signal(horizons, "pose matrix", "base").with_poses_as(layout, along=1).values

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -191,3 +192,14 @@ def test_a_capture_that_cannot_be_measured_ends_the_look_without_a_word() -> Non
     assert look.see(frame_of(wrong=(0,)).view(0)) is None
     empty = replace(frame_of().view(0), world_from_camera=None, frame_id=None)
     assert (look.see(empty), look.see(frame_of(wrong=(0, 1))), look.end()) == (None, None, None)
+
+
+def test_a_check_that_breaks_does_not_stop_who_reads(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(*_: Any) -> Any:
+        raise RuntimeError("linalg")
+
+    monkeypatch.setattr(first_look, "CHECKS", {"poses": SimpleNamespace(
+        findings={first_look.POSES: (), first_look.UNIT: ()}, of=(DepthFrame,), judge=broken, memory=tuple, whole=None
+    )})  # fmt: skip
+    look = FirstLook()
+    assert (look.see(frame_of()), look.end()) == (None, None)
