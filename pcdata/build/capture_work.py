@@ -12,7 +12,7 @@ from pcdata.build.config import BuildConfig
 from pcdata.build.origins import Origin, origin_of
 from pcdata.build.records import BuiltSample
 from pcdata.contracts.on_host import counts_of
-from pcdata.errors import CacheError, CaptureError, ConfigError, ReplayError, WriteError
+from pcdata.errors import CacheError, CaptureError, ConfigError, PcdataError, ReplayError, WriteError, locate
 from pcdata.files.inputs import Inputs, recording
 from pcdata.io.sources.capture_source import CaptureSource
 from pcdata.io.store.cloud_record import Record, record_from_cloud
@@ -20,6 +20,7 @@ from pcdata.io.writers.capture_folder import write_capture
 from pcdata.structures import DepthFrame, PointCloud, Signal
 from pcdata.transforms import Compose, FuseTSDF, ToFrame, Transform
 from pcdata.transforms.decisions import Decision
+from pcdata.validation.first_look import look_at_refused
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,10 @@ class CaptureWork:
             capture = self.source.load(sample_id)
         if self.keep_raw and not isinstance(capture, DepthFrame):
             raise CaptureError("output.keep_raw is on, but this source gives clouds: there is no depth image to keep")
-        cloud = self.prefix(capture)
+        try:
+            cloud = self.prefix(capture)
+        except PcdataError as error:
+            raise _with_look(error, capture) from error
         if not isinstance(cloud, PointCloud):
             raise ConfigError(
                 f"the pipeline gives a {type(cloud).__name__}, not a cloud to store; end depth in Deproject"
@@ -74,6 +78,17 @@ class CaptureWork:
             record.digest(),
         )
         return Made(capture, record, _one_each(cloud), sample, origin_of(cloud))
+
+
+def _with_look(error: PcdataError, capture: DepthFrame | PointCloud) -> PcdataError:
+    """Return the error of a step, with what a look at the capture finds, which may well be its cause."""
+    told = look_at_refused(capture)
+    if told is None:
+        return error
+    first, *more = str(error).split("\n")
+    explained = type(error)("\n".join([f"{first}; {told}", *more]))
+    locate(explained, step=getattr(error, "step", None), sample_id=getattr(error, "sample_id", None))
+    return explained
 
 
 def keep_raw(capture: DepthFrame | PointCloud, folder: Path) -> None:

@@ -185,7 +185,7 @@ def error_in_words(error: BaseException) -> str:
     step = getattr(error, "step", None)
     kind = MemoryError.__name__ if is_out_of_memory(error) else type(error).__name__
     head = f"{kind} in {step}" if step else kind
-    return f"{head}: {lines[0]:.500}" if lines else head
+    return f"{head}: {lines[0]:.1000}" if lines else head
 
 
 def _write_signals(

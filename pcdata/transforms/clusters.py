@@ -10,7 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from pcdata.errors import ConfigError, DTypeError
+from pcdata.errors import ConfigError, DTypeError, TooFewPointsError
 from pcdata.functional.areas import seen_areas
 from pcdata.functional.clusters import dbscan
 from pcdata.functional.image_clusters import image_clusters
@@ -250,7 +250,24 @@ class ClusterObjects(DropLimit):
         if self.keep == "all":
             return labeled
         member = labels >= 0
+        for b, one in enumerate(listed):
+            if not one["objects"] and any(lost[b] for lost in counted.values()):
+                raise self._no_object(data, b, {name: lost[b] for name, lost in counted.items()})
         return labeled.select(member, ptr_after_mask(member, data.ptr))
+
+    def _no_object(self, data: PointCloud, b: int, counted: dict[str, int]) -> TooFewPointsError:
+        """Say what became of the points of a cloud without objects, and what to do about the most of them."""
+        advice = {
+            "noise": "use a larger eps or fewer min_points; are the points in metres?",
+            "too_small": "lower min_size or min_area",
+            "too_large": "put RemovePlane or CropWorkspace before it, or raise max_size or max_area",
+        }
+        return TooFewPointsError(
+            f"ClusterObjects: cloud {b}{sample_name(data, b)} has no object: of {sum(counted.values())} points "
+            f"{counted['noise']} are noise, {counted['too_small']} in clusters that are too small and "
+            f"{counted['too_large']} in ones that are too large; {advice[max(counted, key=lambda one: counted[one])]}; "
+            "or keep: all"
+        )
 
 
 def _picked(views: list[View], rows: Tensor, count: int) -> list[View]:

@@ -1,4 +1,4 @@
-"""A look at a few captures, while they are read, for a wrong unit of depth, and for poses that lead elsewhere."""
+"""A look at a few captures, while they are read, for wrong units and intrinsics, and for poses that lead elsewhere."""
 
 from __future__ import annotations
 
@@ -12,18 +12,25 @@ from pcdata.validation import checks as _checks  # noqa: F401  # registers them
 from pcdata.validation.capture_check import CHECKS, Check
 from pcdata.validation.capture_limits import CaptureLimits
 from pcdata.validation.checks.depth_unit import NAME as UNIT
+from pcdata.validation.checks.focal_length import NAME as FOCAL
 from pcdata.validation.checks.pose_direction import NAME as POSES
 from pcdata.verdicts import Finding, Verdict
 
 _PLACES = (0, 1, 2, 4, 8, 16, 32, 64)  # of captures in order: near enough to see alike, far enough to have moved
-_SUBJECTS = {UNIT: "the unit of depth looks", POSES: "the poses look"}
+_OF_IMAGE = ("principal_point", "field_of_view")  # what intrinsics alone tell
+_SUBJECTS = {
+    UNIT: "the unit of depth looks",
+    POSES: "the poses look",
+    **dict.fromkeys((*_OF_IMAGE, FOCAL), "the intrinsics look"),
+}
 
 
 class FirstLook:
     """A look at some of the captures that somebody reads anyway, in their order; none is read for it, one is kept.
 
-    The unit is that of the first capture. Poses are judged within it, where it has several views, or else from capture
-    to capture: up to the 65th, or the last where there are fewer. What cannot be measured says nothing here.
+    Unit and intrinsics are those of the first capture. Poses, and focal lengths by them, are judged within it, where it
+    has several views, or else from capture to capture: up to the 65th, or the last where there are fewer. What cannot
+    be measured says nothing here.
     """
 
     def __init__(self, *, by_pose: bool = True) -> None:
@@ -49,7 +56,7 @@ class FirstLook:
             self._look.at(self._latest)
         self._latest = None
         finding = self._look.concluded()
-        return None if finding is None else f"{_SUBJECTS[finding.name]} wrong: {finding.found}; {finding.advice}"
+        return None if finding is None else _in_words(finding)
 
 
 def judge_of_all(source: object, path: str = "") -> str:
@@ -58,8 +65,14 @@ def judge_of_all(source: object, path: str = "") -> str:
     return f"({' '.join(filter(None, ['pcdata validate', place and shlex.quote(place)]))} judges all captures)"
 
 
+def look_at_refused(capture: DepthFrame | PointCloud) -> str | None:
+    """Say what is wrong with the unit or the intrinsics of a capture that a step has refused."""
+    finding = first_fault([capture], by_pose=False)
+    return None if finding is None else _in_words(finding)
+
+
 def first_fault(captures: Iterable[DepthFrame | PointCloud], *, by_pose: bool = True) -> Finding | None:
-    """Return the check of the unit, or else of the poses, that fails for captures in their order; None = neither."""
+    """Return the check of unit, intrinsics or poses that fails for captures in their order; None = none of them."""
     look = _Look(by_pose)
     for capture in captures:
         look.at(capture)
@@ -69,13 +82,15 @@ def first_fault(captures: Iterable[DepthFrame | PointCloud], *, by_pose: bool = 
 
 
 class _Look:
-    """What the checks of the unit and of the poses find, capture after capture."""
+    """What the checks of the unit, the intrinsics and the poses find, capture after capture."""
 
     def __init__(self, by_pose: bool) -> None:
         self.is_done = False
         self._by_pose = by_pose
         self._limits = CaptureLimits()
-        self._checks: list[tuple[Check, tuple[Any, ...]]] = [(check, check.memory()) for check in _named(POSES)]
+        self._checks: list[tuple[Check, tuple[Any, ...]]] = [
+            (check, check.memory()) for check in (*_named(FOCAL), *_named(POSES))
+        ]
         self._is_first = True
         self._fault: Finding | None = None
         self._found: list[Finding] = []
@@ -92,10 +107,11 @@ class _Look:
         is_first, self._is_first = self._is_first, False
         if not isinstance(capture, DepthFrame):
             return self._without_poses()
-        for check in _named(UNIT) if is_first else ():
-            if fault := _failed(UNIT, check.judge(capture, self._limits, (), *check.memory())):
-                self._fault = fault
-                return self._without_poses()  # of depth that is known to be wrong no pose can be told
+        for name in (UNIT, *_OF_IMAGE) if is_first else ():
+            for check in _named(name):
+                if fault := _failed(name, check.judge(capture, self._limits, (), *check.memory())):
+                    self._fault = fault
+                    return self._without_poses()  # of depth or a camera known to be wrong no pose can be told
         if not self._by_pose or capture.world_from_camera is None:
             return self._without_poses()
         for check, memory in self._checks:
@@ -116,7 +132,11 @@ class _Look:
                 found += check.whole(*memory, self._limits) if check.whole is not None else []
         except Exception:
             return fault
-        return fault or _failed(POSES, found[::-1])
+        return fault or _failed(FOCAL, found[::-1]) or _failed(POSES, found[::-1])
+
+
+def _in_words(finding: Finding) -> str:
+    return f"{_SUBJECTS[finding.name]} wrong: {finding.found}; {finding.advice}"
 
 
 def _named(name: str) -> list[Check]:

@@ -39,13 +39,21 @@ USUAL: Mapping[str, _Usual] = {
     "RemoveRadiusOutliers": _Usual(0.0, 0.15, _OUTLIERS),
     # A table is most of what a camera above it sees; less than a fiftieth is no plane that things stand on.
     "RemovePlane": _Usual(
-        0.02, 0.995, "it took another plane than the one that things stand on: give distance, up and max_tilt"
+        0.02,
+        0.995,
+        "it measured no table, of which a warning tells and says what to do, or took another plane than the one that "
+        "things stand on: then give distance, up and max_tilt",
     ),
     "CropWorkspace": _Usual(0.0, 0.99, _CROP),
     "CropPolygon": _Usual(0.0, 0.99, _CROP),
     "CropCenter": _Usual(0.0, 0.99, _CROP),
     # Of clutter on a table, objects are what is left: noise between them is the smaller part.
-    "ClusterObjects": _Usual(0.0, 0.7, "most of what is left is called noise: use a larger eps, or fewer min_points"),
+    "ClusterObjects": _Usual(
+        0.0,
+        0.7,
+        "most of what is left is noise, or in clusters under or over the limits of size, which meta['no_objects'] "
+        "counts: of noise use a larger eps or fewer min_points, of clusters other limits, or remove the table before",
+    ),
     "SplitObjects": _Usual(0.0, 0.7, "most of what is left is in no object: use a larger eps, or other limits of size"),
     # These leave the number that somebody asked for; see _MOST_REPEATS for the other end.
     **dict.fromkeys(

@@ -87,7 +87,9 @@ def test_numbers_start_at_zero_in_every_cloud():
 
 
 def test_no_object_is_a_typed_error_only_when_objects_are_kept():
-    with pytest.raises(TooFewPointsError, match="ClusterObjects: nothing is left of cloud 0"):
+    with pytest.raises(
+        TooFewPointsError, match="ClusterObjects: cloud 0 has no object: of 10 points 0 are noise, 10 in"
+    ):
         ClusterObjects(**STEP)(blobs(10))
     assert ClusterObjects(**STEP, keep="all")(blobs(10)).labels.tolist() == [-1] * 10
 

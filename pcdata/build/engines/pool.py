@@ -15,6 +15,7 @@ import pickle
 import signal
 import threading
 import time
+import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
@@ -26,7 +27,7 @@ from pcdata.build.records import ShardRecord
 from pcdata.build.schedule import Schedule, Task
 from pcdata.build.shard_work import Job
 from pcdata.build.tally import Tally, stop_in_words, stopped
-from pcdata.errors import CacheError, ConfigError
+from pcdata.errors import CacheError, ConfigError, PcdataWarning
 from pcdata.files.interrupts import deaf_children, shielded
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMEXPR_NUM_THREADS")
@@ -115,6 +116,10 @@ def _hear(worker: _Worker, schedule: Schedule, tally: Tally) -> None:
         kind, *told = worker.pipe.recv()
     except (EOFError, OSError):
         _bury(worker, schedule, tally)
+        return
+    if kind == "warned":
+        category, text = told
+        warnings.warn(text, category, stacklevel=2)
         return
     worker.since = time.monotonic()
     if kind == "started":
@@ -246,7 +251,7 @@ class _Teller:
     """Tells the parent of every capture."""
 
     def __init__(self, pipe: Connection) -> None:
-        self.pipe = pipe
+        self.pipe, self.show_here = pipe, warnings.showwarning
 
     def begins(self, sample_id: str) -> None:
         self.pipe.send(("begins", sample_id))
@@ -254,12 +259,21 @@ class _Teller:
     def ends(self, sample_id: str, error: str | None) -> None:
         self.pipe.send(("ends", sample_id, error))
 
+    def show(self, message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        """Take the place of ``warnings.showwarning``: warnings of pcdata are the parent's to show."""
+        is_ours = issubclass(category, PcdataWarning) and category.__module__.startswith("pcdata.")
+        if is_ours and threading.current_thread() is threading.main_thread():  # two at once would garble the pipe
+            self.pipe.send(("warned", category, str(message)))
+        else:
+            self.show_here(message, category, *place, **more)
+
 
 def _serve(pipe: Connection) -> None:
     """Do tasks until there are no more."""
     _end_with_parent()
     torch.set_num_threads(1)
     teller = _Teller(pipe)
+    warnings.showwarning = teller.show
     pipe.send(("started",))
     try:
         job: Job = pipe.recv()

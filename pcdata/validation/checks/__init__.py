@@ -13,6 +13,7 @@ from pcdata.validation.checks import at_origin
 from pcdata.validation.checks import strays
 from pcdata.validation.checks import sequence
 from pcdata.validation.checks import pose_direction  # not of views whose depth is of another moment or unit
+from pcdata.validation.checks import focal_length
 from pcdata.validation.checks import view_overlap  # not of views whose poses lead the wrong way
 from pcdata.validation.checks import color_on_depth
 from pcdata.validation.checks import pose_direction_over_time
@@ -25,6 +26,7 @@ __all__ = [
     "color_on_depth",
     "coverage",
     "depth_axis",
+    "focal_length",
     "largest_plane",
     "objects",
     "pose_direction",
