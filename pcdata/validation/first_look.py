@@ -107,9 +107,10 @@ class _Look:
         is_first, self._is_first = self._is_first, False
         if not isinstance(capture, DepthFrame):
             return self._without_poses()
-        for name in (UNIT, *_OF_IMAGE) if is_first else ():
-            for check in _named(name):
-                if fault := _failed(name, check.judge(capture, self._limits, (), *check.memory())):
+        for names in (UNIT,), _OF_IMAGE:
+            for check in _named(names[0]) if is_first else ():
+                judged = check.judge(capture, self._limits, (), *check.memory())
+                if fault := _failed(judged, *names):
                     self._fault = fault
                     return self._without_poses()  # of depth or a camera known to be wrong no pose can be told
         if not self._by_pose or capture.world_from_camera is None:
@@ -132,7 +133,7 @@ class _Look:
                 found += check.whole(*memory, self._limits) if check.whole is not None else []
         except Exception:
             return fault
-        return fault or _failed(FOCAL, found[::-1]) or _failed(POSES, found[::-1])
+        return fault or _failed(found[::-1], FOCAL) or _failed(found[::-1], POSES)
 
 
 def _in_words(finding: Finding) -> str:
@@ -143,5 +144,5 @@ def _named(name: str) -> list[Check]:
     return [check for check in CHECKS.values() if name in check.findings and DepthFrame in check.of]
 
 
-def _failed(name: str, found: Sequence[Finding]) -> Finding | None:
-    return next((one for one in found if one.name == name and one.verdict is Verdict.FAIL), None)
+def _failed(found: Sequence[Finding], *names: str) -> Finding | None:
+    return next((one for one in found if one.name in names and one.verdict is Verdict.FAIL), None)
