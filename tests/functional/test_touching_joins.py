@@ -13,6 +13,7 @@ from pcdata.functional.touching.faces import Scene
 from pcdata.functional.touching.joining import Objects, join_hollows, join_occluded
 from pcdata.functional.touching.limits import KINECT_NOISE, RAMP, Limits
 from pcdata.functional.touching.windows import PixelCamera
+from pcdata.rng import seeded
 
 CAMERA = PixelCamera(500.0, 500.0, 29.5, 19.5)
 ROWS, COLUMNS = 40, 60
@@ -121,6 +122,23 @@ def test_what_was_not_read_between_two_parts_of_a_face_says_nothing(every):
     assert objects.scene.seen_between(between)[3] > 0.1  # of the way nothing is known
     join_occluded(objects)
     assert objects.object_of == [0, 0]
+
+
+def behind_a_post(*, lower: float) -> Objects:
+    """Look straight down at two tops beside a nearer post, one of them so many metres lower."""
+    depth = torch.full((ROWS, COLUMNS), 0.8, dtype=torch.float64)
+    depth[:, 40:] += lower
+    depth[:, 20:40] = 0.6
+    depth += 0.001 * torch.randn(ROWS, COLUMNS, generator=seeded(5)).double()
+    label = torch.tensor([0] * 20 + [1] * 20 + [2] * 20).expand(ROWS, COLUMNS).clone()
+    return Objects(scene(1 / depth, torch.zeros_like(depth), label))
+
+
+@pytest.mark.parametrize("lower", [0.0, 0.002, 0.01, 0.02, -0.02])
+def test_tops_of_one_height_behind_something_are_one_and_those_of_two_heights_stay(lower):
+    objects = behind_a_post(lower=lower)
+    join_occluded(objects)
+    assert objects.object_of == ([0, 1, 0] if abs(lower) < 0.005 else [0, 1, 2])
 
 
 @pytest.mark.parametrize("side", [16, 24])

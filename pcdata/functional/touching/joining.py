@@ -27,11 +27,12 @@ _CONTACT_PIXELS = 5  # fewer are no contact
 _HOLLOW_RISE, _HOLLOW_PART, _NOT_CONVEX = 0.06, 0.6, -0.05
 _RIM, _WALL_RIM, _WITHIN = 0.015, 0.02, 0.015  # metres
 _ENCLOSED = 0.9  # part of its border along which an inside must meet higher regions for all of them to be its wall
-# Two parts of one face: their planes turn less than 14 degrees, and each other's middle is off by less than 3 cm; one
-# plane fits both nearly as well as each its own; they are beside each other, within 25 cm; and the way from one to the
-# other is hidden. Where they touch it is seen, and all is stricter; pixels without a reading say nothing, up to half.
-_TURN, _OFF, _APART, _BESIDE = 14.0, 0.03, 0.25, 0.5
-_PLANE_RMS, _CURVED_RMS = 0.0035, 0.012
+# Two parts of one face: their planes turn less than 14 degrees, and each other's middle is off by less than 3 cm and by
+# no more than that turn explains and 3 degrees that both may be tilted by; one plane fits both nearly as well as each
+# its own; they are beside each other, within 25 cm; and the way from one to the other is hidden. Where they touch it is
+# seen, and all is stricter; pixels without a reading say nothing, up to half.
+_TURN, _TILT, _OFF, _APART, _BESIDE = 14.0, 3.0, 0.03, 0.25, 0.5
+_CURVED_RMS = 0.008
 _MOST_FREE, _LEAST_HIDDEN, _LEAST_UNSEEN = 0.1, 0.25, 0.6
 _TOUCH_TURN, _TOUCH_APART, _TOUCH_SEEN, _TOUCH_UNSEEN, _TOUCH_RMS = 8.0, 0.006, 0.9, 0.5, 0.004
 
@@ -235,14 +236,15 @@ def join_occluded(objects: Objects) -> None:
         if objects.object_of[a] == objects.object_of[b]:
             continue
         turn = math.degrees(math.acos(max(-1.0, min(1.0, float(one.normal @ other.normal)))))
-        if turn > _TURN:
+        rms, least = max(one.rms, other.rms), min(one.rms, other.rms)
+        if turn > _TURN or rms > min(_CURVED_RMS * rough, 2.5 * max(least, 1e-4)):
             continue
         way = other.center - one.center
-        if max(abs(float(way @ one.normal)), abs(float(way @ other.normal))) > _OFF:
+        off = max(abs(float(way @ one.normal)), abs(float(way @ other.normal)))
+        if off > min(_OFF, float(way.norm()) * math.sin(math.radians(turn + _TILT)) + 2 * rms):
             continue
-        rms, least = max(one.rms, other.rms), min(one.rms, other.rms)
         joint = one.joint_rms(other)
-        if joint > max(_PLANE_RMS * rough, 1.15 * rms + 0.0005) or rms > 2.5 * max(least, 1e-4):
+        if joint > 1.15 * rms + 0.0005:
             continue
         distance, between = one.way_to(other)
         if distance > _APART:
@@ -256,7 +258,7 @@ def join_occluded(objects: Objects) -> None:
 
 
 def _plane_faces(objects: Objects) -> Iterator[tuple[int, Face]]:
-    """Yield a region of each with its face: regions, then objects of several that are nearly plane as a whole."""
+    """Yield a region of each face that is large enough to have a plane: regions, then objects of several."""
     for region in range(objects.scene.num_regions):
         face = objects.face([region])
         if face.area >= _FACE:
@@ -264,5 +266,5 @@ def _plane_faces(objects: Objects) -> Iterator[tuple[int, Face]]:
     for regions in objects.members().values():
         if len(regions) > 1:
             face = objects.face(regions)
-            if face.area >= _FACE and face.rms < _CURVED_RMS:
+            if face.area >= _FACE:
                 yield regions[0], face
