@@ -10,7 +10,7 @@ import torch
 
 from pcdata.functional.touching.contacts import Contacts
 from pcdata.functional.touching.faces import Scene
-from pcdata.functional.touching.joining import Objects, join_hollows, join_occluded
+from pcdata.functional.touching.joining import Objects, _is_hollow, join_hollows, join_occluded
 from pcdata.functional.touching.limits import KINECT_NOISE, RAMP, Limits
 from pcdata.functional.touching.windows import PixelCamera
 from pcdata.rng import seeded
@@ -110,6 +110,22 @@ def test_a_smeared_rim_does_not_hide_that_an_inside_is_hollow(radius):
     label = torch.where(clear.label >= 0, 0, -1)
     faces = [Objects(replace(clear, label=label, normals=one)).face([0]) for one in (clear.normals, smeared)]
     assert all(face.hollow[0] > 0.2 and face.hollow[1] > 0.95 for face in faces)
+
+
+@pytest.mark.parametrize("num_regions", [1, 2])
+def test_two_sides_of_a_corner_are_no_inside(num_regions):
+    # Two noisy planes that lean toward each other, a fifth of the points on one: pairs across rise, of others half.
+    columns = torch.arange(COLUMNS, dtype=torch.float64)
+    side = (columns > 11.5).double()
+    lean = math.radians(20) * (2 * side - 1)
+    normal = torch.stack([-lean.sin(), torch.zeros_like(lean), -lean.cos()], -1).expand(ROWS, COLUMNS, 3)
+    depth = 0.8 - math.tan(math.radians(20)) * 0.8 / CAMERA.fx * (columns - 11.5).abs()
+    depth = depth + 0.001 * torch.randn(ROWS, COLUMNS, generator=seeded(2)).double()
+    label = (side if num_regions == 2 else 0 * side).long().expand(ROWS, COLUMNS).clone()
+    face = Objects(replace(scene(1 / depth, depth, label), normals=normal.clone())).face(list(range(num_regions)))
+    assert face.hollow[0] > 0.06
+    assert 0.6 < face.hollow[1] < 0.72
+    assert _is_hollow(face, num_regions) == (num_regions == 1)
 
 
 @pytest.mark.parametrize("every", [2, 4])

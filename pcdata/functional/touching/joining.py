@@ -23,8 +23,9 @@ PARTS_FROM = 0.35
 _FACE, _HOLLOW, _LEAST_HOLLOW, _SLIVER = 6.6e-4, 9.2e-4, 3.2e-4, 1.3e-3
 _CONTACT_PIXELS = 5  # fewer are no contact
 # The inside of a bowl: mean sine of the rise over tangent planes, and the part that rises. Real bowls have 0.07 to 0.29
-# and boxes and cylinders seen from outside less than 0.
-_HOLLOW_RISE, _HOLLOW_PART, _NOT_CONVEX = 0.06, 0.6, -0.05
+# and boxes and cylinders seen from outside less than 0. Of several regions more must rise: two boxes that lean toward
+# each other, taken for one, have 0.6 to 0.7.
+_HOLLOW_RISE, _HOLLOW_PART, _HOLLOW_PARTS, _NOT_CONVEX = 0.06, 0.6, 0.72, -0.05
 _RIM, _WALL_RIM, _WITHIN = 0.015, 0.02, 0.015  # metres
 _ENCLOSED = 0.9  # part of its border along which an inside must meet higher regions for all of them to be its wall
 # Two parts of one face: their planes turn less than 14 degrees, and each other's middle is off by less than 3 cm and by
@@ -147,7 +148,7 @@ def join_hollows(objects: Objects) -> None:
     contacts = objects.contacts()
     depth = scene.points[:, 2].cpu()
     for start, face in faces.items():
-        if not _is_hollow(face):
+        if not _is_hollow(face, len(members[start])):
             continue
         rim, seen, todo = face.top, {start}, [start]
         while todo:
@@ -202,12 +203,13 @@ def _join_enclosing(objects: Objects, depth: torch.Tensor) -> None:
                 objects.join(region, other, "hollow")
 
 
-def _is_hollow(face: Face) -> bool:
+def _is_hollow(face: Face, num_regions: int = 1) -> bool:
     """Say whether a face is concave as a whole; the smaller it is the clearer, as it has fewer normals to average."""
     if face.area < _LEAST_HOLLOW:
         return False
     rise, part = face.hollow
-    return rise > _HOLLOW_RISE * math.sqrt(max(_HOLLOW / face.area, 1.0)) and part > _HOLLOW_PART
+    least = _HOLLOW_PART if num_regions == 1 else _HOLLOW_PARTS
+    return rise > _HOLLOW_RISE * math.sqrt(max(_HOLLOW / face.area, 1.0)) and part > least
 
 
 def _is_wall(objects: Objects, pair: tuple[int, int], inside: int, rim: float, depth: torch.Tensor) -> bool:
