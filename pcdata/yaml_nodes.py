@@ -194,6 +194,11 @@ class YamlDocument(Document):
             way = "; indent with spaces, a tab is none" if "'\\t'" in str(fault.problem) else ""
             self.fault_at(fault.problem_mark, f"not valid YAML: {fault.problem:.200}{way}")
             self.raise_faults()
+        except yaml.reader.ReaderError as fault:
+            raise error(
+                f"{name}: not valid YAML: character {fault.position} is number {fault.character}, which no text has; "
+                "is it another file, or damaged?"
+            ) from fault
         except yaml.YAMLError as fault:
             raise error(f"{name}: not valid YAML: {fault}") from fault
         except RecursionError as fault:
