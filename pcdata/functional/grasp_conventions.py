@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import ConfigError, ShapeError, near_matches
-from pcdata.functional.grasps import ParallelJaw
+from pcdata.functional.grasps import LONGEST, ParallelJaw
 from pcdata.geometry.rigid import check_rigid
 
 Axis = Literal["x", "y", "z"]
@@ -111,8 +111,8 @@ def _tips(where: str, name: str, convention: GraspConvention, given: Tensor | fl
         tips = tips.expand(len(grasps))
     if tips.shape != grasps.shape[:1]:
         raise ShapeError(f"{where}: {name}_tips must be one number or ({len(grasps)},), got {tuple(tips.shape)}")
-    if not bool(torch.isfinite(tips).all()):
-        raise ConfigError(f"{where}: {name}_tips must be finite metres")
+    if not bool((tips.abs() <= LONGEST).all()):
+        raise ConfigError(f"{where}: {name}_tips must be finite metres, at most {LONGEST:g}; are they in millimetres?")
     return tips
 
 

@@ -11,12 +11,14 @@ from torch import Tensor
 
 from pcdata.contracts.dispatch import inner
 from pcdata.contracts.tensors import check_tensors
-from pcdata.errors import ConfigError, ShapeError
+from pcdata.errors import ConfigError, PoseError, ShapeError
 from pcdata.geometry.rigid import check_rigid
 from pcdata.threads import at_once
 
 Axis = Literal["x", "y", "z"]
 _AXES = ("x", "y", "z")
+LONGEST = 2.0  # metres of any part of a gripper, and from its origin to its tips
+_EXTENTS, _FARTHEST = 10.0, 10.0  # of the points, metres: a grasp farther from all of them is of another unit or frame
 _TOGETHER = 16  # grasps at a time: their offsets from 20,000 points stay in a cache
 
 
@@ -40,7 +42,7 @@ class ParallelJaw:
         closing: the axis that the fingers move along.
 
     Raises:
-        ConfigError: a length that is not positive, or one axis for both.
+        ConfigError: a length that is not positive or above 2, or one axis for both.
     """
 
     opening: float
@@ -64,6 +66,11 @@ class ParallelJaw:
                 raise ConfigError(f"ParallelJaw: {field.name} must be a finite number of metres, got {value!r}")
             elif value is not None and field.name != "tip" and value <= 0:
                 raise ConfigError(f"ParallelJaw: {field.name} must be more than 0, got {value!r}")
+            elif value is not None and abs(value) > LONGEST:
+                raise ConfigError(
+                    f"ParallelJaw: {field.name} must be in metres, at most {LONGEST:g}, got {value!r}; is it in "
+                    f"millimetres? Those are {value / 1000:g} m"
+                )
         if self.approach == self.closing:
             raise ConfigError(f"ParallelJaw: approach and closing must be two axes, both are {self.approach!r}")
 
@@ -116,6 +123,21 @@ class GraspChecks(NamedTuple):
     held: Tensor  # (G,) int64 points between the fingers
 
 
+def _check_near(where: str, points: Tensor, grasps: Tensor) -> None:
+    """Require that one grasp lies within ten times the points' own extent of them, or within 10 m."""
+    if not len(points) or not len(grasps):
+        return
+    lower, upper = (corner.double() for corner in points.aminmax(dim=0))
+    origins = grasps[:, :3, 3].double()
+    nearest = float(torch.linalg.vector_norm(origins - origins.clamp(lower, upper), dim=1).min())
+    extent = float(torch.linalg.vector_norm(upper - lower))
+    if nearest > max(_EXTENTS * extent, _FARTHEST):
+        raise PoseError(
+            f"{where}: the nearest of {len(grasps)} grasps lies {nearest:.0f} m from the points, which extend over "
+            f"{extent:.2g} m; translations are metres in the frame of the points: are these millimetres?"
+        )
+
+
 def check_grasps(
     points: Tensor,  # (N, 3) float32
     *,
@@ -139,8 +161,8 @@ def check_grasps(
         plane: unit normal, away from the table, and offset; None = no table.
 
     Raises:
-        PoseError: a grasp is not rigid.
-        ConfigError: an opening that is not positive, or more than the gripper's.
+        PoseError: a grasp is not rigid; or all lie so far from the points that they are of another unit or frame.
+        ConfigError: an opening that is not positive, or more than the gripper's; tips farther than 2 from the origin.
         ShapeError, DTypeError, NonFiniteError: an argument breaks the contract above.
     """
     where = "check_grasps"
@@ -151,11 +173,14 @@ def check_grasps(
     if plane is not None and plane.shape != (4,):
         raise ShapeError(f"{where}: plane must be (4,), got {tuple(plane.shape)}")
     check_rigid(f"{where}: grasps", grasps)
+    _check_near(where, points, grasps)
     wide = torch.full((len(grasps),), gripper.opening, dtype=torch.float64, device=grasps.device)
     if openings is not None:
         wide = openings.double()
         if bool(((wide <= 0) | (wide > gripper.opening * (1 + 1e-6))).any()):
             raise ConfigError(f"{where}: openings must be above 0 and at most the gripper's {gripper.opening:g}")
+    if tips is not None and bool((tips.abs() > LONGEST).any()):
+        raise ConfigError(f"{where}: tips must be in metres, at most {LONGEST:g}; are they in millimetres?")
     lower, upper = gripper.boxes(wide, tips)
     axes, origin = gripper.axes(grasps), grasps[:, :3, 3].double()
     angle = clearance = None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pcdata.contracts.tensors import check_tensors
 from pcdata.errors import UnitError
 from pcdata.functional.grasps import GraspChecks, ParallelJaw, check_grasps
 from pcdata.structures import METRE, PointCloud
@@ -41,6 +42,8 @@ def judge_grasps(
         UnitError: no frame is given and the cloud is not in metres.
         PoseError, ConfigError, ShapeError, DTypeError, NonFiniteError: as :func:`pcdata.functional.check_grasps`.
     """
+    given = {"grasps": grasps, "openings": openings, "tips": tips}
+    check_tensors("judge_grasps", given, {"grasps": "G 4 4 : float", "openings": "G : float", "tips": "G : float"})
     own = cloud[b]
     if frame is not None:
         own = own.to_frame(frame)
@@ -54,8 +57,5 @@ def judge_grasps(
     if plane is not None and own.meta[0]["planes"][-1].get("faces") == "neither side" and own.num_points:
         height = own.points.double() @ plane[:3] + plane[3]
         plane = torch.where(height.median() < 0, -plane, plane)  # what is left stands on it
-    each = {
-        name: None if given is None else given.to(own.device)
-        for name, given in (("grasps", grasps), ("openings", openings), ("tips", tips))
-    }
+    each = {name: None if one is None else one.to(own.device) for name, one in given.items()}
     return check_grasps(own.points, **each, gripper=gripper, plane=plane)  # type: ignore[arg-type]

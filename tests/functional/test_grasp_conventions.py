@@ -174,3 +174,9 @@ def test_unknown_names_and_missing_tips_are_told():
         convert_grasps(grasps, source=GraspConvention("x", "x", 0.0), target="m2t2")
     assert convert_grasps(grasps[:0], source=PANDA, target="graspnet", target_tips=0.02).shape == (0, 4, 4)
     assert torch.equal(convert_grasps(grasps, source=PANDA, target="contact_graspnet"), grasps.double())
+
+
+def test_tips_in_millimetres_are_refused():
+    grasps = torch.eye(4, dtype=torch.float64)[None]
+    with pytest.raises(ConfigError, match=r"target_tips must be finite metres, at most 2; are they in millimetres\?"):
+        convert_grasps(grasps, source="contact_graspnet", target="graspnet", target_tips=20.0)

@@ -112,3 +112,32 @@ def test_wrong_grasps_and_grippers_are_refused():
     for field, value in (("finger_width", 0.0), ("tip", math.nan), ("approach", "w"), ("closing", "z")):
         with pytest.raises(ConfigError, match=f"ParallelJaw: .*{field}"):
             ParallelJaw(**{**vars(PANDA), field: value})
+
+
+@pytest.mark.parametrize("field", ["opening", "finger_length", "tip", "palm_span"])
+def test_a_gripper_in_millimetres_is_refused(field: str):
+    good = {"opening": 0.08, "finger_length": 0.045, "finger_thickness": 0.01, "finger_width": 0.02}
+    good |= {"palm_length": 0.06, "palm_span": 0.2, "tip": 0.1034}
+    ParallelJaw(**good)
+    with pytest.raises(
+        ConfigError, match=rf"{field} must be in metres, .* is it in millimetres\? Those are {good[field]:g} m"
+    ):
+        ParallelJaw(**good | {field: 1000 * good[field]})
+
+
+def test_grasps_far_from_all_points_are_of_another_unit_or_frame():
+    points = torch.rand(500, 3, generator=seeded(3)) + torch.tensor([0.3, 0.0, 0.1])
+    grasps = poses(5) + 0.0
+    grasps[:, :3, 3] += 0.4
+    in_millimetres = grasps.clone()
+    in_millimetres[:, :3, 3] *= 1000
+    with pytest.raises(PoseError, match=r"the nearest of 5 grasps lies \d+ m from the points, .* millimetres"):
+        check_grasps(points, grasps=in_millimetres, gripper=PANDA)
+    in_millimetres[2] = grasps[2]  # one that is near: the others are wild, not of another unit
+    check_grasps(points, grasps=in_millimetres, gripper=PANDA)
+    grasps[:, 0, 3] += 8.0  # a small cloud, and a robot that waits across the room
+    check_grasps(0.01 * points, grasps=grasps, gripper=PANDA)
+    check_grasps(points[:0], grasps=in_millimetres[:1], gripper=PANDA)
+    check_grasps(points, grasps=in_millimetres[:0], gripper=PANDA)
+    with pytest.raises(ConfigError, match="tips must be in metres"):
+        check_grasps(points, grasps=grasps, gripper=PANDA, tips=torch.full((5,), 20.0))

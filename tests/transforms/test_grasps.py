@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from pcdata.errors import FrameError, UnitError
+from pcdata.errors import DTypeError, FrameError, UnitError
 from pcdata.functional import ParallelJaw
 from pcdata.rng import seeded
 from pcdata.structures import PointCloud
@@ -82,3 +82,12 @@ def test_without_a_table_there_are_only_points():
     assert found.angle is None
     assert found.clearance is None
     assert found.held[0] > 50
+
+
+def test_grasps_that_are_no_tensor_are_named():
+    cloud, _ = scene()
+    grasps = torch.eye(4, dtype=torch.float64)[None]
+    with pytest.raises(DTypeError, match=r"judge_grasps: grasps must be a torch.Tensor, .*not ndarray"):
+        judge_grasps(cloud, grasps.numpy(), GRIPPER)
+    with pytest.raises(DTypeError, match=r"judge_grasps: openings must be a torch.Tensor, .*not list"):
+        judge_grasps(cloud, grasps, GRIPPER, openings=[0.05])
