@@ -132,6 +132,9 @@ class Counted:
         self.ids = [f"{number:03d}" for number in range(count)]
         self.loaded.clear()
 
+    def __len__(self) -> int:
+        return len(self.ids)
+
     def load(self, sample_id: str) -> DepthFrame:
         self.loaded.append(sample_id)
         return replace(self._views[int(sample_id) % 2], sample_id=sample_id)
@@ -203,3 +206,13 @@ def test_a_check_that_breaks_does_not_stop_who_reads(monkeypatch: pytest.MonkeyP
     )})  # fmt: skip
     look = FirstLook()
     assert (look.see(frame_of()), look.end()) == (None, None)
+
+
+def test_fuse_reads_no_capture_twice_and_tells_it_before_the_last_is_fused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = Counted(4)
+    monkeypatch.setattr("pcdata.cli.fuse.open_captures", lambda *_, **__: source)
+    assert main(["fuse", "somewhere", "--voxel-size", "0.02", "--out", str(tmp_path / "s.ply")]) == 0
+    assert source.loaded == source.ids
+    assert "fuse: the poses look wrong: " in capsys.readouterr().err
