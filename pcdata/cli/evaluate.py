@@ -39,6 +39,13 @@ def add_to(commands: Any) -> None:
             help=f"labels of {whose} that are no object, such as 0,1,255, beside negative ones (default: 0 in images)",
         )
     evaluate.add_argument(
+        "--ignore",
+        type=whole_numbers,
+        default=(),
+        metavar="IDS",
+        help="labels of TRUE that are not scored, nor what is predicted there, such as a robot's",
+    )
+    evaluate.add_argument(
         "--true-parts",
         type=positive,
         metavar="N",
@@ -94,7 +101,9 @@ def _label_pairs(arguments: argparse.Namespace) -> Iterator[tuple[str, LabelFile
     from pcdata.validation.stored_labels import labels_of_sample, paired_samples
 
     def read_true(path: Path) -> LabelFile:
-        return read_label_file(path, background=arguments.true_background, parts=arguments.true_parts)
+        return read_label_file(
+            path, background=arguments.true_background, ignore=arguments.ignore, parts=arguments.true_parts
+        )
 
     if Manifest.is_one(Path(arguments.true)):
         raise ConfigError(f"evaluate: {arguments.true} is a dataset, which may be PREDICTED alone; give TRUE as files")

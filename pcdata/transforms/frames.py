@@ -74,12 +74,14 @@ class ToFrame(SpatialTransform):
         frames = _known_frames(data)
         for name in (self.frame, data.frame_id):
             if name not in frames:
+                others = sorted(set(frames) - {data.frame_id, self.frame})
+                named = f"name one of them, such as frame: {others[0]}, everywhere; or " if others else ""
                 hint = near_matches(name, frames)
                 raise FrameError(
                     f"ToFrame: no pose leads from {data.frame_id!r} to {self.frame!r}: the cloud knows the frames "
-                    f"{sorted(frames)}{hint}; give the capture poses (world_from_camera= of arrays; poses/NAME.txt of "
-                    "a plain folder, with --frame; --calibration FILE; a recording's tf by --frame), or ToFrame a "
-                    "matrix and its start"
+                    f"{sorted(frames)}{hint}; {named}give the capture poses (world_from_camera= of arrays; "
+                    "poses/NAME.txt of a plain folder, with --frame; --calibration FILE; a recording's tf by --frame), "
+                    "or ToFrame a matrix and its start"
                 )
         return {"matrix": frames[self.frame] @ torch.linalg.inv(frames[data.frame_id])}
 

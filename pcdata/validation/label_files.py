@@ -26,16 +26,22 @@ class LabelFile:
         labels: (M,) int64, -1 = no object.
         place: (M,) int64, the pixel or the row of the file that each belongs to; what has no reading has no label.
         size: (height, width) where places are pixels.
+        unscored: (M,) bool, what counts for neither, as nobody knows its object; None = nothing.
     """
 
     path: Path
     labels: Tensor
     place: Tensor
     size: tuple[int, int] | None
+    unscored: Tensor | None = None
 
 
 def read_label_file(
-    path: str | os.PathLike[str], *, background: Collection[int] | None = None, parts: int | None = None
+    path: str | os.PathLike[str],
+    *,
+    background: Collection[int] | None = None,
+    ignore: Collection[int] = (),
+    parts: int | None = None,
 ) -> LabelFile:
     """Read the object of every pixel of a label image, or of every point of a cloud.
 
@@ -43,6 +49,7 @@ def read_label_file(
         path: an 8-bit, 16-bit or palette PNG, or a PCD or PLY with a field of labels.
         background: labels that are no object, such as the table's, beside negative ones; None = 0 in images and where
             parts are joined, none in clouds, whose first object pcdata calls 0.
+        ignore: labels of what is not to be scored, such as a robot's or that of all that nobody labeled.
         parts: objects are labeled in parts: the label divided by this, without the rest, is the object.
 
     Raises:
@@ -74,12 +81,16 @@ def read_label_file(
         labels = torch.where(labels < 0, labels, labels.div(parts, rounding_mode="floor"))
     if background is None:
         background = (0,) if suffix in IMAGES or parts is not None else ()
-    listed = torch.tensor(sorted(background), dtype=torch.int64, device="cpu")
-    return LabelFile(path, torch.where((labels < 0) | torch.isin(labels, listed), -1, labels), place, size)
+    none, unscored = (
+        torch.isin(labels, torch.tensor(sorted(listed), dtype=torch.int64, device="cpu"))
+        for listed in (background, ignore)
+    )
+    labels = torch.where((labels < 0) | none | unscored, -1, labels)
+    return LabelFile(path, labels, place, size, unscored if ignore else None)
 
 
 def matched_labels(predicted: LabelFile, true: LabelFile) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return predicted and true labels of the same pixels (H, W) or rows (N,), and which of them have no truth.
+    """Return predicted and true labels of the same pixels (H, W) or rows (N,), and which of them are not scored.
 
     A cloud without pixels goes with the readings of an organized one, in its order, as it does where it was read from
     that file and kept whole.
@@ -97,12 +108,12 @@ def matched_labels(predicted: LabelFile, true: LabelFile) -> tuple[Tensor, Tenso
             )
         place = true.place
     if true.size is None:
-        return predicted.labels, true.labels, None
+        return predicted.labels, true.labels, true.unscored
     height, width = true.size
     guess, truth = (torch.full((height * width,), -1, dtype=torch.int64, device="cpu") for _ in range(2))
     guess[place], truth[true.place] = predicted.labels, true.labels
     blank = torch.ones(height * width, dtype=torch.bool, device="cpu")
-    blank[true.place] = False
+    blank[true.place] = False if true.unscored is None else true.unscored
     return guess.reshape(true.size), truth.reshape(true.size), blank.reshape(true.size)
 
 

@@ -66,7 +66,8 @@ def test_a_matrix_replaces_the_pose_of_the_capture():
 
 def test_unknown_frames_are_refused_with_those_known():
     with pytest.raises(
-        FrameError, match=r"no pose leads from 'base' to 'world'.*knows the frames \['base', 'camera'\]"
+        FrameError,
+        match=r"from 'base' to 'world'.*knows the frames \['base', 'camera'\]; name one of them, such as frame: camera",
     ):
         ToFrame(frame="world")(cloud_in_base())
     bare = PointCloud(points=torch.zeros(3, 3), frame_id="camera")

@@ -10,8 +10,10 @@ import torch
 
 from pcdata.build import build_dataset, config_from_yaml
 from pcdata.cli.main import main
-from pcdata.io import write_depth, write_labels
+from pcdata.io import write_depth, write_labels, write_pcd
 from pcdata.report.segmentation_text import segmentation_text
+from pcdata.structures import PointCloud
+from pcdata.validation.label_files import matched_labels, read_label_file
 from pcdata.validation.segmentation import score_segmentation
 
 _STEPS = """
@@ -99,6 +101,22 @@ def test_every_sample_needs_its_truth(scenes, tmp_path, capsys):
     assert "is a dataset, which may be PREDICTED alone" in capsys.readouterr().err
     assert main(["evaluate", folder, str(scenes / "truth"), "--background", "0"]) == 2
     assert "--background is for files" in capsys.readouterr().err
+
+
+def test_what_is_ignored_counts_for_neither(scenes, capsys):
+    assert main(["evaluate", str(_built(scenes, "whole")), str(scenes / "truth"), "--ignore", "9"]) == 0
+    last = capsys.readouterr().out.splitlines()[-1].split()
+    assert last[1:] == ["2", "2", *["1.000"] * 8]
+    rows = read_label_file(scenes / "truth" / "0000.png", ignore=[9, 0])
+    _, truth, blank = matched_labels(rows, rows)
+    assert blank is not None
+    assert blank.tolist() == (truth != 4).tolist()
+    cloud = PointCloud(points=torch.rand(4, 3), frame_id="camera", labels=torch.tensor([0, 0, 1, 7]))
+    write_pcd(scenes / "cloud.pcd", cloud)
+    rows = read_label_file(scenes / "cloud.pcd", ignore=[7])
+    _, _, blank = matched_labels(rows, rows)
+    assert blank is not None
+    assert blank.tolist() == [False, False, False, True]
 
 
 def test_scores_of_nothing_and_of_depth_images_say_so():
