@@ -10,7 +10,13 @@ import torch
 
 from pcdata.functional.touching.contacts import Contacts
 from pcdata.functional.touching.faces import Scene
-from pcdata.functional.touching.joining import Objects, _is_hollow, join_hollows, join_occluded
+from pcdata.functional.touching.joining import (
+    Objects,
+    _is_hollow,
+    join_hollows,
+    join_occluded,
+    merge_weak_contacts,
+)
 from pcdata.functional.touching.limits import KINECT_NOISE, RAMP, Limits
 from pcdata.functional.touching.windows import PixelCamera
 from pcdata.rng import seeded
@@ -138,6 +144,35 @@ def test_what_was_not_read_between_two_parts_of_a_face_says_nothing(every):
     assert objects.scene.seen_between(between)[3] > 0.1  # of the way nothing is known
     join_occluded(objects)
     assert objects.object_of == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("rows_in_contact", "strength", "are_one"), [(2, 0.0, False), (20, 0.0, True), (20, 0.5, False)]
+)
+def test_two_faces_are_one_where_their_contact_is_weak_and_not_short(rows_in_contact, strength, are_one):
+    label = (torch.arange(COLUMNS) >= 30).long().expand(ROWS, COLUMNS).clone()
+    flat = torch.full((ROWS, COLUMNS), 1 / 0.8, dtype=torch.float64)
+    first = torch.arange(rows_in_contact) * COLUMNS + 29
+    contacts = Contacts(first, first + 1, torch.full((rows_in_contact,), strength, dtype=torch.float64))
+    objects = Objects(replace(scene(flat, torch.zeros_like(flat), label), contacts=contacts))
+    assert objects.length_of((0, 1)) == pytest.approx(rows_in_contact * 0.8 / 500)
+    merge_weak_contacts(objects)
+    assert objects.object_of == ([0, 0] if are_one else [0, 1])
+
+
+@pytest.mark.parametrize(("rows_of_each", "are_one"), [(4, False), (6, True)])
+def test_contacts_add_up_as_objects_grow(rows_of_each, are_one):
+    # Two regions that touch each other, and a third: each for itself along too little.
+    label = torch.zeros(ROWS, COLUMNS, dtype=torch.int64)
+    label[:20, 30:], label[20:, 30:] = 1, 2
+    flat = torch.full((ROWS, COLUMNS), 1 / 0.8, dtype=torch.float64)
+    beside = (torch.arange(2 * rows_of_each) + 20 - rows_of_each) * COLUMNS + 29
+    below = 19 * COLUMNS + torch.arange(30, 60)
+    first, second = torch.cat([beside, below]), torch.cat([beside + 1, below + COLUMNS])
+    contacts = Contacts(first, second, torch.zeros(len(first), dtype=torch.float64))
+    objects = Objects(replace(scene(flat, torch.zeros_like(flat), label), contacts=contacts))
+    merge_weak_contacts(objects)
+    assert objects.object_of == ([0, 0, 0] if are_one else [0, 1, 1])
 
 
 def behind_a_post(*, lower: float) -> Objects:

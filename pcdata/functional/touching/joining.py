@@ -18,6 +18,8 @@ from pcdata.functional.touching.limits import KINECT_NOISE
 
 # Regions whose contact is weaker than this on the mean are one object.
 PARTS_FROM = 0.35
+# Nor does a contact say that they are one which is shorter than this part of the smaller one's width.
+_LEAST_LENGTH = 0.3
 # Square metres. A face of 6.6 cm2 (250 pixels of a Kinect at 0.85 m) has a plane; 9.2 cm2 have a curvature, 3.2 cm2 a
 # strong one; in a bowl, what is below the rim and smaller than 13 cm2 is a part of it.
 _FACE, _HOLLOW, _LEAST_HOLLOW, _SLIVER = 6.6e-4, 9.2e-4, 3.2e-4, 1.3e-3
@@ -96,6 +98,12 @@ class Objects:
             found[x, y] = (old_total + total, old_count + count, [*pairs, (a, b)])
         return found
 
+    def length_of(self, pair: tuple[int, int]) -> float:
+        """Return about how long the contact of two regions is, in metres."""
+        rows = self._rows[pair]
+        depth = self.scene.points[:, 2].cpu()[self.scene.contacts.first.cpu()[rows]]
+        return float(depth.sum()) / self.scene.camera.fx
+
     def contact_pixels(self, pairs: list[tuple[int, int]], of: int) -> tuple[torch.Tensor, torch.Tensor]:
         """Return the pixels of contacts between regions: those of object ``of``, and their neighbors."""
         rows = torch.cat([self._rows[pair] for pair in pairs])
@@ -118,20 +126,31 @@ class Objects:
 
 
 def merge_weak_contacts(objects: Objects) -> None:
-    """Join the two objects with the weakest contact, until every contact is strong; contacts grow as objects do."""
-    contact = {pair: (total, count) for pair, (total, count, _) in objects.contacts().items()}
-    while contact:
-        strength, pair = min((total / count, pair) for pair, (total, count) in contact.items())
-        if strength > PARTS_FROM:
+    """Join the two objects with the weakest contact, until every contact is strong; contacts grow as objects do.
+
+    A contact that is short beside the smaller of the two says nothing: where two things touch at a corner, too few
+    points lie around it to show the step.
+    """
+    area = {one: objects.face([one]).area for one in range(objects.scene.num_regions)}
+    contact = {pair: (total, count, objects.length_of(pair)) for pair, (total, count, _) in objects.contacts().items()}
+
+    def joins(pair: tuple[int, int]) -> bool:
+        total, count, length = contact[pair]
+        return total <= PARTS_FROM * count and length >= _LEAST_LENGTH * math.sqrt(min(area[pair[0]], area[pair[1]]))
+
+    while True:
+        weak = [(contact[pair][0] / contact[pair][1], pair) for pair in contact if joins(pair)]
+        if not weak:
             return
-        kept, gone = pair
+        kept, gone = min(weak)[1]
         objects.join(kept, gone)
-        joined: dict[tuple[int, int], tuple[float, int]] = {}
-        for (a, b), (total, count) in contact.items():
+        area[kept] += area.pop(gone)
+        joined: dict[tuple[int, int], tuple[float, int, float]] = {}
+        for (a, b), found in contact.items():
             x, y = sorted((kept if a == gone else a, kept if b == gone else b))
             if x != y:
-                before = joined.get((x, y), (0.0, 0))
-                joined[x, y] = (before[0] + total, before[1] + count)
+                before = joined.get((x, y), (0.0, 0, 0.0))
+                joined[x, y] = (before[0] + found[0], before[1] + found[1], before[2] + found[2])
         contact = joined
 
 
