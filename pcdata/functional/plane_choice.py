@@ -14,6 +14,7 @@ from pcdata.functional.selection import over_hull, plane_axes
 _LEAST_LEAN = 0.1
 # Of the distance: what makers of depth cameras allow theirs. A far floor is as thick as this.
 _WORST_NOISE = 0.02
+_LEVEL = 0.5  # cosine of a plane and a rough up
 _NOTHING = 1e-3  # of a floor's area: a few stray voxels; a cube of 5 cm on 2 x 2 m is more
 _PARALLEL = math.cos(math.radians(10))  # small planes are found to a few degrees
 _LEAST_VIEW = 0.5  # of that of the floor; the top of a large box on a table reaches a third
@@ -38,26 +39,47 @@ def chosen_plane(
     rest = voxels[label < 0]
     if len(rest):  # two edges of a voxel: neighbors over a corner
         part = dbscan(rest, eps=4 * distance, min_points=1, backend=backend)
+    backs = _backs(planes, up, eye)
     planes = planes.to(voxels.device)
-    best = int(_scores(voxels, label, planes, up, part, distance).argmax())
+    best = int(_scores(voxels, label, planes, up, backs, part, distance).argmax())
     return _higher(best, voxels, label, planes, None if eye is None else eye.to(voxels.device), part, distance)
 
 
+def _backs(planes: Tensor, up: Tensor | None, eye: Tensor | None) -> list[bool]:
+    """Say which planes are seen from below, as the front of a box by a steep camera: it only leans as up is rough.
+
+    None where no level plane is seen from above, and none parallel to the most level of those: then the eye is wrong.
+    """
+    if up is None or eye is None:
+        return [False] * len(planes)
+    level, below = planes[:, :3] @ up, _heights(eye, planes.T) < 0
+    best = int(torch.where(below, -math.inf, level).argmax())
+    if bool(below[best]) or float(level[best]) < _LEVEL:
+        return [False] * len(planes)
+    return (below & (planes[:, :3] @ planes[best, :3] < _PARALLEL)).tolist()
+
+
 def _scores(
-    voxels: Tensor, label: Tensor, planes: Tensor, up: Tensor | None, part: Tensor, distance: float
+    voxels: Tensor,
+    label: Tensor,
+    planes: Tensor,
+    up: Tensor | None,
+    backs: list[bool],
+    part: Tensor,
+    distance: float,
 ) -> Tensor:  # (P,) float64 on the CPU
-    """Score planes by their area, by what stands on them and by how level they are."""
+    """Score planes by their area, by what stands on them and by how level they are; their backs bear nothing."""
     rest = voxels[label < 0]
     scores = []
-    for number, plane in enumerate(planes):
+    for number, (plane, is_back) in enumerate(zip(planes, backs)):
         own = voxels[label == number]
         standing = 0
-        if len(rest):
+        if len(rest) and not is_back:
             height = _heights(rest, plane)
             over = over_hull(rest, own, plane, 2 * distance)
             # What is no higher than 3 distances may be noise of the plane.
             standing = _standing(height, over, part, 3 * distance, 4 * distance)
-        level = 1.0 if up is None else _LEAST_LEAN + max(0.0, float(plane[:3].cpu() @ up))
+        level = 1.0 if up is None else _LEAST_LEAN + (0.0 if is_back else max(0.0, float(plane[:3].cpu() @ up)))
         scores.append(len(own) * (1 + standing) * level)
     return torch.tensor(scores, dtype=torch.float64, device="cpu")
 

@@ -151,7 +151,9 @@ def supporting_plane(
     cut. Each scores its area, times one more than the
     area of what stands on it, times how level it is: 0.1 + max(0, cosine of its normal and up); the highest wins, the
     first found of equals. What stands on a plane is what is left without any plane, in connected parts that reach down
-    to it, above it and over its convex hull, less what noise puts below it.
+    to it, above it and over its convex hull, less what noise puts below it. With ``up`` and ``viewpoint``, what is seen
+    from below is the front of something, as up is rough: nothing stands on it, and it counts as if it held up. That is
+    where it leans by 10 degrees from the most level plane seen from above, and that by less than 60 from up.
 
     Where nothing stands on the winner, a plane above it and parallel to it within 10 degrees is taken instead, the
     highest below the viewpoint: an empty table, rather than the larger floor around it. It must fill half as much of

@@ -123,6 +123,22 @@ def test_up_and_a_limit_bind_the_search():
         supporting_plane(cloud, max_tilt=0.1)
 
 
+def test_a_front_that_is_seen_from_below_is_no_table_whatever_up_is_roughly():
+    """The normal of a wall before the table points away from a steep camera where it is turned along a rough up.
+
+    Then a ball behind the wall, whose foot on the table is hidden, stands on it.
+    """
+    pitch, up = math.radians(45), (0.0, -1.0, -0.3)
+    front = rectangle((-0.25, -0.3, 0.0), (0.02, 0.0, 0.5), (0.0, 0.6, 0.0), seed=2)
+    shell = torch.nn.functional.normalize(torch.randn(5000, 3, generator=seeded(3)), dim=1) * 0.13
+    ball = shell + torch.tensor([-0.1, 0.0, 0.3])
+    cloud = seen_from_camera(joined(front, ball, rectangle(**TABLE, seed=0)), pitch)
+    level = torch.tensor([0.0, -math.cos(pitch), -math.sin(pitch)], dtype=torch.float64)
+    for given in ({"likely_up": up}, {"up": up, "viewpoint": (0.0, 0.0, 0.0)}):
+        plane, _ = supporting_plane(cloud, **given)
+        assert float(plane[0, :3] @ level) > 0.999, given
+
+
 def test_every_way_to_run_finds_the_same_plane():
     things = [box((x, 0.1, 0.0), (0.08, 0.06, 0.12), seed=9) for x in (0.1, -0.2)]
     clouds = [joined(rectangle(**TABLE, seed=seed), *things) for seed in (0, 1)]
