@@ -84,7 +84,7 @@ class RemovePlane(RemoveTransform):
 
     runs_statistics = True
     decides_by = "point"  # but over the hull of the rows near the plane, and where their noise is measured
-    version = 9
+    version = 10
 
     distance: Metres = 0.01
     num_hypotheses: Count = 1000
