@@ -133,9 +133,10 @@ def _principal_point(
         off,
         limits=limits.principal_point,
         found=f"({cx:.1f}, {cy:.1f}) in an image of {width}x{height}",
-        advice=f"such intrinsics belong to an image of about {2 * cx + 1:.0f}x{2 * cy + 1:.0f}: if this one was "
-        f"resized, use Camera.resized(({height}, {width})); if cropped, Camera.cropped; if the camera itself cuts its "
-        "images from those of the sensor (narrow modes of Azure Kinect and Femto), K is right: say is_window of it",
+        advice=f"such intrinsics belong to an image of about {2 * cx + 1:.0f}x{2 * cy + 1:.0f}: state this one's "
+        f"(in Python of a resized image Camera.resized(({height}, {width})), of a cropped one Camera.cropped); if the "
+        "camera itself cuts its images from those of the sensor (narrow modes of Azure Kinect and Femto), K is right: "
+        "say is_window of it",
         view=view,
     )
 
