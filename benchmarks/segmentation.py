@@ -3,9 +3,10 @@
     PCDATA_TEST_DATA=... python benchmarks/segmentation.py [--parts PART ...] [--pictures FOLDER]
 
 Scenes: the Object Segmentation Database as modified by Alexandrov (`osd/`, or --osd FOLDER); a number says its kind.
-One set of numbers for all of them. `heaps`: 20 touching objects, rendered in 4 views that are merged. `kinds` fits
-three numbers on three kinds of scenes and scores the fourth. `enlarged`: the same scenes as a stereo camera whose depth
-lies on the pixels of color would give them, smoothed and enlarged. Prints tables and writes results/segmentation.json.
+One set of numbers for all of them. `heaps`: 20 touching objects, rendered in 4 views that are merged; `one_view`: 6
+to 20, each heap seen by one camera. `kinds` fits three numbers on three kinds of scenes and scores the fourth.
+`enlarged`: the same scenes as a stereo camera whose depth lies on the pixels of color would give them, smoothed and
+enlarged. Prints tables and writes results/segmentation.json.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from scipy.ndimage import binary_dilation, distance_transform_edt, uniform_filte
 from torch import Tensor
 
 import pcdata
+from pcdata.errors import TooFewPointsError
 from pcdata.functional import ParallelJaw, check_grasps
 from pcdata.functional.touching import joining, regions, separation
 from pcdata.functional.touching.limits import Limits
@@ -53,9 +55,11 @@ from pcdata.validation import SegmentationScores, mean_scores, score_segmentatio
 
 OUTLINES = Path(__file__).parent / "apc_outlines.json"  # frame -> object -> corners (u, v), the nearest object last
 RESULT = Path(__file__).parent / "results" / "segmentation.json"
-PARTS = ("table", "time", "ablation", "kinds", "other", "enlarged", "heaps")
+PARTS = ("table", "time", "ablation", "kinds", "other", "enlarged", "heaps", "one_view")
 HEAPS = {"seen while the method was made": range(6), "unseen": range(100, 106)}  # seeds
 HEAP_SENSORS = ("kinect_v1", "realsense_d415")
+ONE_VIEW = {"seen while the method was made": range(200, 212), "unseen": range(400, 412)}
+ONE_VIEW_OBJECTS = (6, 12, 20)
 ENLARGED = {  # pixels that depth is smoothed over, and how many times as large it then is
     "enlarged": (1, 2.133),
     "smoothed over 3 pixels": (3, 1.0),
@@ -105,6 +109,8 @@ def main() -> None:
         found["enlarged"] = enlarged(scenes)
     if "heaps" in arguments.parts:
         found["heaps"] = heaps(arguments.limit or 1)
+    if "one_view" in arguments.parts:
+        found["one_view"] = one_view(arguments.limit or 1)
     if arguments.osd is None and arguments.limit is None:
         RESULT.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
@@ -577,6 +583,44 @@ def heaps(every: int) -> dict[str, Any]:
             result[f"{sensor}, {kind}"] = {"mean": shown, "cpu_milliseconds": milliseconds, "mean_iou": each}
             rows.append([sensor, kind, *(f"{value:.3f}" for value in shown.values()), milliseconds])
     print(text_table(("heaps of 20, 4 views", "seeds", *HEAP_SHOWN, "CPU ms"), rows))
+    return result
+
+
+def one_view(every: int) -> dict[str, Any]:
+    """Score heaps that one camera saw, and count those whose table was found."""
+    step = ClusterObjects(split_touching=True, max_size=1_000_000, keep="all")
+    table_ = RemovePlane(which="supporting", cut="measured", probability=0.9999, up=(0, 0, 1), frame="base")
+    result: dict[str, Any] = {}
+    rows = []
+    for sensor in HEAP_SENSORS:
+        seen = Compose([RandomSensorNoise(sensor=sensor), Deproject(), ToFrame(frame="base")])
+        for number in ONE_VIEW_OBJECTS:
+            for kind, seeds in ONE_VIEW.items():
+                scores, tables = {}, 0
+                for seed in seeds[::every]:
+                    frame = tabletop(seed, number, 1, touching=True, floor=False).frame
+                    cloud = seen(frame, generator=torch.Generator().manual_seed(seed))
+                    truth = torch.where(cloud.labels > 0, cloud.labels, -1)
+                    labels = torch.full_like(truth, -1)
+                    try:
+                        rest = table_(cloud)
+                    except TooFewPointsError:  # all of it was taken for the table
+                        rest = None
+                    if rest is not None:
+                        place = torch.full((int(cloud.source_index.max()) + 1,), -1)
+                        place[cloud.source_index] = torch.arange(len(truth))
+                        found = step(rest)
+                        labels[place[found.source_index]] = found.labels
+                        is_left = torch.zeros(len(truth), dtype=torch.bool)
+                        is_left[place[rest.source_index]] = True
+                        tables += int(float((~is_left)[truth < 0].float().mean()) > 0.9)
+                    scores[seed] = score_segmentation(labels, truth)
+                shown = {key: statistics.fmean(getattr(one, key) for one in scores.values()) for key in HEAP_SHOWN}
+                each = {str(seed): round(one.overlap_f, 4) for seed, one in scores.items()}
+                told = f"{tables} of {len(scores)}"
+                result[f"{sensor}, {number} objects, {kind}"] = {"mean": shown, "tables": told, "overlap_f": each}
+                rows.append([sensor, number, kind, *(f"{value:.3f}" for value in shown.values()), told])
+    print(text_table(("heaps in one view", "objects", "seeds", *HEAP_SHOWN, "tables found"), rows))
     return result
 
 
