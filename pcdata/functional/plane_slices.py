@@ -14,14 +14,16 @@ from pcdata.functional.rows import ptr_from_counts
 _REACH, _NEIGHBORS, _FEWEST = 5, 12, 6  # two and a half edges of a voxel: what a surface is fitted to
 _FLAT = 0.05  # of the variance of neighbors, across their surface: beyond, noise or an edge tells nothing
 _ALONG = math.cos(math.radians(35))
+_PARALLEL = math.cos(math.radians(10))
 _MOST_ACROSS = 0.1  # a table has 0.03 at the feet of what stands on it, noisy floors 0.04; slices of heaps 0.05 to 0.6
 
 
 def without_slices(voxels: Tensor, label: Tensor, planes: Tensor, distance: float, backend: str) -> Tensor:
     """Take from planes that cut through things, not along their surfaces, the voxels of what they cut.
 
-    A slab through a heap may hold as many voxels as a table: of the sides of all that is in it. What stands on the
-    table would be a plane itself then, and nothing be left that stands on one.
+    A slab through a heap, parallel to the table, holds many voxels: of the sides of all that is in it. What stands on
+    the table would be a plane itself then, and nothing be left that stands on one. Only planes within 10 degrees of a
+    larger one are slices: of others it is not known what they would cut through.
 
     Source: Schnabel et al., Efficient RANSAC for point-cloud shape detection, Computer Graphics Forum 26, 2007 (points
     belong to a plane whose normals deviate little from its own).
@@ -43,6 +45,10 @@ def without_slices(voxels: Tensor, label: Tensor, planes: Tensor, distance: floa
     is_flat = (count >= _FEWEST) & (across < _FLAT * total)
     own = label.clamp(min=0)
     is_across = (label >= 0) & is_flat & ((normal.double() * planes[own, :3]).sum(1).abs() < _ALONG)
-    ones = torch.ones_like(label)
-    whole, cut = (torch.zeros_like(label).index_add_(0, own, ones * mask)[own] for mask in (label >= 0, is_across))
-    return torch.where(is_across & (cut > _MOST_ACROSS * whole), -1, label)
+    whole, cut = (
+        torch.zeros(len(planes), dtype=torch.int64, device=label.device).index_add_(0, own, mask.long())
+        for mask in (label >= 0, is_across)
+    )
+    is_parallel = (planes[:, :3] @ planes[:, :3].T).abs() > _PARALLEL
+    is_slice = (cut > _MOST_ACROSS * whole) & (is_parallel & (whole > whole[:, None])).any(1)
+    return torch.where(is_across & is_slice[own], -1, label)

@@ -182,6 +182,11 @@ class Face:
         return float(self.heights.double().quantile(0.97))
 
     @cached_property
+    def bottom(self) -> float:
+        """Height that 97 % of the points are above."""
+        return float(self.heights.double().quantile(0.03))
+
+    @cached_property
     def hollow(self) -> tuple[float, float]:
         """Return how far the points rise over each other's tangent planes: mean sine, and the part that rises at all.
 

@@ -29,6 +29,7 @@ _CONTACT_PIXELS = 5  # fewer are no contact
 # each other, taken for one, have 0.6 to 0.7.
 _HOLLOW_RISE, _HOLLOW_PART, _HOLLOW_PARTS, _NOT_CONVEX = 0.06, 0.6, 0.72, -0.05
 _RIM, _WALL_RIM, _WITHIN = 0.015, 0.02, 0.015  # metres
+_BELOW_RIM = 0.25  # of its height: what meets an inside higher up meets it over the rim, as the bowl beside it does
 _ENCLOSED = 0.9  # part of its border along which an inside must meet higher regions for all of them to be its wall
 # Two parts of one face: their planes turn less than 14 degrees, and each other's middle is off by less than 3 cm and by
 # no more than that turn explains and 3 degrees that both may be tilted by; one plane fits both nearly as well as each
@@ -181,8 +182,17 @@ def join_hollows(objects: Objects) -> None:
                 own, beside = objects.contact_pixels(regions, objects.object_of[one])
                 behind = float((depth[beside] - depth[own]).median())
                 part = faces[other]
+                length = float(depth[own].sum()) / scene.camera.fx
+                if length < _LEAST_LENGTH * math.sqrt(min(part.area, face.area)):
+                    continue
                 is_below = part.top < rim + _RIM
-                is_inside = part.hollow[0] > _NOT_CONVEX and abs(behind) < _WITHIN and is_below
+                meets = float(scene.height.flatten().cpu()[own].median())
+                is_inside = (
+                    part.hollow[0] > _NOT_CONVEX
+                    and abs(behind) < _WITHIN
+                    and is_below
+                    and meets < rim - _BELOW_RIM * (rim - face.bottom)
+                )
                 is_wall = any(_is_wall(objects, pair, objects.object_of[one], rim, depth) for pair in regions)
                 if not (is_inside or is_wall or (is_below and part.area < _SLIVER)):
                     continue
