@@ -118,6 +118,33 @@ def test_a_smeared_rim_does_not_hide_that_an_inside_is_hollow(radius):
     assert all(face.hollow[0] > 0.2 and face.hollow[1] > 0.95 for face in faces)
 
 
+def two_bowls(apart: float, *, radius: float = 0.03, rows_in_contact: int = ROWS) -> Objects:
+    """Look straight down, from 0.8 m, at two half balls beside each other, each so many radii from the line between."""
+    rows_, columns = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in (ROWS, COLUMNS)), indexing="ij")
+    x, y = (columns - CAMERA.cx) / CAMERA.fx * 0.8, (rows_ - CAMERA.cy) / CAMERA.fy * 0.8
+    x = x - torch.where(x > 0, apart * radius, -apart * radius)
+    rise = (radius**2 - x * x - y * y).clamp(min=0).sqrt()
+    there = x * x + y * y < (0.9 * radius) ** 2
+    normal = torch.where(there[..., None], torch.stack([-x, -y, -rise], -1) / radius, 0.0)
+    label = torch.where(there, (columns > CAMERA.cx).long(), -1)
+    beside = (label[:, 29] == 0) & (label[:, 30] == 1) & ((rows_[:, 0] - CAMERA.cy).abs() < rows_in_contact / 2)
+    pixel = beside.nonzero().squeeze(1) * COLUMNS + 29
+    contacts = Contacts(pixel, pixel + 1, torch.ones(len(pixel), dtype=torch.float64))
+    flat = torch.where(there, 1 / (0.8 + rise), 0.0)
+    return Objects(Scene(flat, label, normal, 0.1 - rise, contacts, CAMERA, 1e-3, Limits()))
+
+
+@pytest.mark.parametrize(
+    ("apart", "rows_in_contact", "are_one"), [(0.5, ROWS, True), (0.82, ROWS, False), (0.5, 6, False)]
+)
+def test_two_bowls_that_meet_over_their_rims_or_along_little_stay_two(apart, rows_in_contact, are_one):
+    objects = two_bowls(apart, rows_in_contact=rows_in_contact)
+    assert all(_is_hollow(objects.face([one])) for one in (0, 1))
+    assert objects.length_of((0, 1)) > 5 * 0.0016
+    join_hollows(objects)
+    assert objects.object_of == ([0, 0] if are_one else [0, 1])
+
+
 @pytest.mark.parametrize("num_regions", [1, 2])
 def test_two_sides_of_a_corner_are_no_inside(num_regions):
     # Two noisy planes that lean toward each other, a fifth of the points on one: pairs across rise, of others half.

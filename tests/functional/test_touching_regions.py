@@ -10,6 +10,7 @@ import torch
 from pcdata.functional.touching.limits import KINECT_NOISE, Limits
 from pcdata.functional.touching.parts import cut_regions, jumps
 from pcdata.functional.touching.regions import smooth_regions
+from pcdata.functional.touching.separation import _without_lines
 from pcdata.functional.touching.windows import PixelCamera
 
 CAMERA = PixelCamera(500.0, 500.0, 59.5, 39.5)
@@ -79,3 +80,18 @@ def test_an_image_without_a_region_or_a_pixel_has_nothing_to_cut():
     for shape in ((3, 4), (0, 4), (3, 0)):
         label = torch.full(shape, -1)
         assert cut(label, torch.zeros(shape, dtype=torch.bool), 1) == label.tolist()
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_missing_line_is_filled_as_a_slope_and_a_jump_beside_it_stays_one(turned):
+    limit = Limits().jump * KINECT_NOISE
+    for step, is_jump in ((10 * KINECT_NOISE, True), (3 * KINECT_NOISE, False)):
+        inverse = 1 + step * (torch.arange(COLUMNS) >= RAMP_FROM).double().expand(ROWS, COLUMNS)
+        inverse[:, RAMP_FROM] = 0
+        inverse = inverse.T.contiguous() if turned else inverse
+        filled = _without_lines(inverse, 2 * limit)
+        assert (filled > 0).all()
+        found = jumps(filled, filled > 0, limit)[1 if turned else 0]
+        assert bool(found.any()) == is_jump
+        middle = filled[RAMP_FROM] if turned else filled[:, RAMP_FROM]
+        assert torch.allclose(middle, torch.tensor(1 if is_jump else 1 + step / 2, dtype=torch.float64))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import torch
@@ -115,10 +116,13 @@ def regions_of(
     What no seed reaches but over a jump belongs to the region that does; without ``over_jumps`` to one of its own.
     """
     inverse, camera, pixel = _image(points, grid)
+    lined = is_lined(pixel, tuple(inverse.shape))
     if noise is None:
-        noise = _measured_noise(inverse)
+        noise = _measured_noise(_without_lines(inverse) if lined else inverse)
     # Nor is more told apart than pixels show: on a surface that leans by 45 degrees 1/z changes by as much in one.
     noise = max(noise, float(inverse[inverse > 0].median()) / camera.fx)
+    if lined:
+        inverse = _without_lines(inverse, 2 * limits.jump * noise)
     inverse = sharpened(inverse, camera, noise, limits)
     heights = None
     if height is not None:
@@ -148,24 +152,24 @@ def _image(points: Tensor, grid: ImageGrid) -> tuple[Tensor, PixelCamera, Tensor
     inverse = torch.zeros(shape, dtype=torch.float64, device=points.device)
     pixel = (v - top) * shape[1] + (u - left)
     inverse.view(-1)[pixel] = 1 / seen[:, 2].double()
-    if is_lined(pixel, shape):
-        inverse = _without_lines(inverse)
     k = grid.intrinsics[0].double().cpu()
     fx, fy, cx, cy = (float(k[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
     return inverse, PixelCamera(fx, fy, cx - left, cy - top), pixel
 
 
-def _without_lines(inverse: Tensor) -> Tensor:
+def _without_lines(inverse: Tensor, most: float = math.inf) -> Tensor:
     """Fill single missing pixels between two that are there by their mean, along rows, along columns and once more.
 
-    Where the two are of different surfaces the mean is of neither, as far from both: a jump stays a jump.
+    By the farther one where the two are more than ``most`` apart: two equal steps would look like a slope, not a jump.
+    No surface that is followed rises by two jumps over two pixels, as noise is at least what one pixel shows.
     """
     filled = inverse.clone()
     for _ in range(2):
         for image in (filled, filled.T):
             before, here, after = image[:, :-2], image[:, 1:-1], image[:, 2:]
             missing = (here == 0) & (before > 0) & (after > 0)
-            here[missing] = (before[missing] + after[missing]) / 2
+            between = torch.where((before - after).abs() > most, torch.minimum(before, after), (before + after) / 2)
+            here[missing] = between[missing]
     return filled
 
 
