@@ -116,7 +116,7 @@ def regions_of(
     What no seed reaches but over a jump belongs to the region that does; without ``over_jumps`` to one of its own.
     """
     inverse, camera, pixel = _image(points, grid)
-    lined = is_lined(pixel, tuple(inverse.shape))
+    lined = is_lined(pixel, (inverse.shape[0], inverse.shape[1]))
     if noise is None:
         noise = _measured_noise(_without_lines(inverse) if lined else inverse)
     # Nor is more told apart than pixels show: on a surface that leans by 45 degrees 1/z changes by as much in one.
