@@ -43,6 +43,7 @@ CHECKS = (
     "repeats",
     "clock",
     "pose_direction",
+    "focal_length",
     "view_overlap",
     "color_on_depth",
     "pose_direction_over_time",
