@@ -44,6 +44,7 @@ CHECKS = (
     "clock",
     "pose_direction",
     "focal_length",
+    "focal_length_over_time",
     "view_overlap",
     "color_on_depth",
     "pose_direction_over_time",
