@@ -83,7 +83,7 @@ def estimate_normals(
         index = torch.where(found, nearest, query[:, None])
         # Offsets from the query keep all digits however far the cloud lies from the origin.
         offset = wide[index] - wide[query][:, None]
-        normal = _smallest_eigenvector(*_covariance(offset, count))
+        normal = smallest_eigenvector(*covariance(offset, count))
         normal = torch.where((count < 3)[:, None], _up(normal), normal)
         normals[query] = _positive_last(normal).float()
     return normals
@@ -160,7 +160,7 @@ _ROUND = 1e-12
 Symmetric = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]  # xx, xy, xz, yy, yz, zz, each (m,) float64
 
 
-def _covariance(offset: Tensor, count: Tensor) -> Symmetric:
+def covariance(offset: Tensor, count: Tensor) -> Symmetric:
     """Return the covariances of (m, k, 3) offsets, of which ``count`` (m,) are neighbors and the rest 0."""
     number = count.clamp(min=1).double()
     x, y, z = offset.unbind(-1)
@@ -174,7 +174,7 @@ def _covariance(offset: Tensor, count: Tensor) -> Symmetric:
     return xx, xy, xz, yy, yz, zz
 
 
-def _smallest_eigenvector(xx: Tensor, xy: Tensor, xz: Tensor, yy: Tensor, yz: Tensor, zz: Tensor) -> Tensor:
+def smallest_eigenvector(xx: Tensor, xy: Tensor, xz: Tensor, yy: Tensor, yz: Tensor, zz: Tensor) -> Tensor:
     """Return the (m, 3) unit eigenvectors of the smallest eigenvalues of symmetric 3x3 matrices, in closed form.
 
     The eigenvalue that stands clear of the other two gives its vector by a cross product. Where that is the largest,

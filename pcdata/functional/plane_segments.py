@@ -15,7 +15,6 @@ from pcdata.contracts.on_host import bounds_of
 from pcdata.errors import NoPlaneError, UnitError
 from pcdata.functional.clusters import density_clusters
 from pcdata.functional.neighbor_rows import nearest_rows
-from pcdata.functional.normals import estimate_normals
 from pcdata.functional.plane_arguments import checked_probability, checked_seeds, checked_tilt, checked_up
 from pcdata.functional.plane_choice import chosen_plane
 from pcdata.functional.plane_slices import without_slices
@@ -125,7 +124,7 @@ def segment_planes(
     min_share=checked_fraction,
     likely_up=checked_up,
     viewpoint=checked_places,
-    steps=(segment_planes, refine_planes, near_planes, nearest_rows, estimate_normals, density_clusters),
+    steps=(segment_planes, refine_planes, near_planes, nearest_rows, density_clusters),
     gradient=False,
 )
 def supporting_plane(

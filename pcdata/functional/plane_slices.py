@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pcdata.functional.neighbor_rows import nearest_rows
-from pcdata.functional.normals import estimate_normals
+from pcdata.functional.normals import covariance, smallest_eigenvector
 from pcdata.functional.rows import ptr_from_counts
 
 _REACH, _NEIGHBORS, _FEWEST = 5, 12, 6  # two and a half edges of a voxel: what a surface is fitted to
@@ -28,27 +28,29 @@ def without_slices(voxels: Tensor, label: Tensor, planes: Tensor, distance: floa
     Source: Schnabel et al., Efficient RANSAC for point-cloud shape detection, Computer Graphics Forum 26, 2007 (points
     belong to a plane whose normals deviate little from its own).
     """
-    if len(planes) < 2:
+    own, has_plane = label.clamp(min=0), label >= 0
+    whole = torch.zeros(len(planes), dtype=torch.int64, device=label.device).index_add_(0, own, has_plane.long())
+    is_parallel = (planes[:, :3] @ planes[:, :3].T).abs() > _PARALLEL
+    may_be_slice = (is_parallel & (whole > whole[:, None])).any(1)
+    rows = (has_plane & may_be_slice[own]).nonzero().squeeze(1)
+    if not len(rows):
         return label
-    one = ptr_from_counts([len(voxels)], device=voxels.device)
-    radius = _REACH * distance
-    nearest, apart = nearest_rows(voxels, one, _NEIGHBORS, radius=radius, backend=backend)
+    everywhere, here = (ptr_from_counts([count], device=voxels.device) for count in (len(voxels), len(rows)))
+    asked = voxels[rows]
+    nearest, apart = nearest_rows(
+        voxels, everywhere, _NEIGHBORS, queries=asked, queries_ptr=here, radius=_REACH * distance, backend=backend
+    )
     there = apart.isfinite()
     count = there.sum(1)
-    itself = torch.arange(len(voxels), dtype=torch.int64, device=voxels.device)[:, None]
     # A neighbor that is missing is the voxel itself and adds nothing to sums of offsets.
-    offset = voxels[torch.where(there, nearest, itself)] - voxels[:, None]
-    normal = estimate_normals(voxels, radius=radius, max_neighbors=_NEIGHBORS, backend=backend)
+    offset = (voxels[torch.where(there, nearest, rows[:, None])] - asked[:, None]).double()
+    normal = smallest_eigenvector(*covariance(offset, count))
     along = (offset * normal[:, None]).sum(-1)
     across = along.square().sum(1) - along.sum(1).square() / count
     total = offset.square().sum((1, 2)) - offset.sum(1).square().sum(1) / count
     is_flat = (count >= _FEWEST) & (across < _FLAT * total)
-    own = label.clamp(min=0)
-    is_across = (label >= 0) & is_flat & ((normal.double() * planes[own, :3]).sum(1).abs() < _ALONG)
-    whole, cut = (
-        torch.zeros(len(planes), dtype=torch.int64, device=label.device).index_add_(0, own, mask.long())
-        for mask in (label >= 0, is_across)
-    )
-    is_parallel = (planes[:, :3] @ planes[:, :3].T).abs() > _PARALLEL
-    is_slice = (cut > _MOST_ACROSS * whole) & (is_parallel & (whole > whole[:, None])).any(1)
-    return torch.where(is_across & is_slice[own], -1, label)
+    own = own[rows]
+    is_across = is_flat & ((normal * planes[own, :3]).sum(1).abs() < _ALONG)
+    cut = torch.zeros_like(whole).index_add_(0, own, is_across.long())
+    is_taken = is_across & (cut > _MOST_ACROSS * whole)[own]
+    return label.index_put((rows,), torch.where(is_taken, -1, own))

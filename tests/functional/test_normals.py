@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pcdata.errors import ConfigError, DTypeError, ShapeError
-from pcdata.functional.normals import _smallest_eigenvector, estimate_normals, facing_normals, orient_normals
+from pcdata.functional.normals import estimate_normals, facing_normals, orient_normals, smallest_eigenvector
 from pcdata.geometry.rigid import angle_between
 
 
@@ -90,7 +90,7 @@ def test_the_closed_form_gives_an_eigenvector_of_the_smallest_eigenvalue(
         values[:] = 0.0
     matrix = rotation @ np.diag(values) @ rotation.T
     entries = [torch.tensor([matrix[i, j]]) for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
-    vector = _smallest_eigenvector(*entries)[0].numpy()
+    vector = smallest_eigenvector(*entries)[0].numpy()
     assert abs(np.linalg.norm(vector) - 1) < 1e-12
     # The Rayleigh quotient is the smallest eigenvalue, up to float64 rounding of the largest.
     assert vector @ matrix @ vector <= values.min() + 1e-12 * max(values.max(), 1e-300)
