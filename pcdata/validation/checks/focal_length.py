@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -15,6 +14,7 @@ from pcdata.validation.measures.pose_conventions import (
     CONVENTIONS,
     Agreement,
     agreement,
+    agreements,
     explains_more,
     has_moved,
     posed_views,
@@ -91,11 +91,7 @@ def focal_length(frame: DepthFrame, limits: CaptureLimits, before: Sequence[Find
     """Judge the views together and each alone; says nothing unless other focal lengths explain what contradicts."""
     doubtful = views_failing(before, "repeated_depth", "depth_unit")
     views = {number: view for number, view in enumerate(posed_views(frame)) if number not in doubtful}
-    given = {
-        (i, j): agreement(views[i], views[j])
-        for i, j in itertools.combinations(views, 2)
-        if has_moved(views[i], views[j])
-    }
+    given = agreements(views)
     numbers = {number for pair in given for number in pair}
     shares = [share(total(one for pair, one in given.items() if number in pair)) for number in numbers]
     if not shares or min(shares) >= _SURE:

@@ -18,9 +18,9 @@ from pcdata.validation.measures.pose_conventions import (
     Agreement,
     advice_of,
     agreement,
+    agreements,
     as_given,
     explains_more,
-    has_moved,
     pose_of,
     posed_views,
     share,
@@ -61,11 +61,7 @@ def pose_direction(frame: DepthFrame, limits: CaptureLimits, before: Sequence[Fi
     """Judge the views together and each alone, but for those whose depth is known to be wrong: they tell no pose."""
     doubtful = views_failing(before, "repeated_depth", "depth_unit")
     views = {number: view for number, view in enumerate(posed_views(frame)) if number not in doubtful}
-    given = {
-        (i, j): agreement(views[i], views[j])
-        for i, j in itertools.combinations(views, 2)
-        if has_moved(views[i], views[j])
-    }
+    given = agreements(views)
     if not given:
         return []
     shares = _shares(given)

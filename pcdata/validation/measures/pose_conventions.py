@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import itertools
+from collections.abc import Callable, Iterable, Mapping
 from typing import NamedTuple
 
 import torch
@@ -164,3 +165,12 @@ def has_moved(a: DepthFrame, b: DepthFrame) -> bool:
     motion = rigid.invert_rigid(pose_of(a)) @ pose_of(b)
     turn = torch.linalg.matrix_norm(motion[:3, :3] - torch.eye(3, dtype=motion.dtype, device=motion.device)) / 2**0.5
     return bool(motion[:3, 3].norm() > _LEAST_MOTION[0]) or bool(turn > _LEAST_MOTION[1])
+
+
+def agreements(views: Mapping[int, DepthFrame]) -> dict[tuple[int, int], Agreement]:
+    """Return how far every two views agree that do not see from the same place."""
+    return {
+        (i, j): agreement(views[i], views[j])
+        for i, j in itertools.combinations(views, 2)
+        if has_moved(views[i], views[j])
+    }
